@@ -14,6 +14,11 @@ Tree = TypeVar("Tree")  # a tree of arrays
 _ROWS = "rows"
 
 
+def on_cpu() -> bool:
+    """Returns whether this process computes on a CPU. For the size of passes; a program's platform decides its code."""
+    return jax.default_backend() == "cpu"
+
+
 def replicate(params: Tree) -> Tree:
     """Puts parameters on every device of this process; with one device, returns them as they are."""
     devices = jax.local_devices()

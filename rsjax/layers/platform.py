@@ -1,61 +1,37 @@
-"""The one place that asks which processor runs, and chooses the implementation; other layers and models do not ask.
+"""The one door to what differs between platforms: each function is lowered to the implementation for its platform.
 
-Axes: N rows, frames or sequences, S cells, h heads, e head width; B images, h×w cells, C and D channels, i×j a kernel.
+The platform is the one that a program is lowered for, so that compiling for a GPU on a machine without one gives the
+GPU's program. Models do not ask for it.
+
+Axes: N rows, frames or sequences, S cells, h heads, e head width; B images, T frames, h×w cells, C and D channels,
+i×j a kernel.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rsjax import runtime
+from rsjax.layers import accelerator
 from rsjax.layers.attention import attend
 from rsjax.layers.cpu import convolution, frame_attention
-from rsjax.layers.cpu.gelu import gelu
-from rsjax.layers.cpu.matmul import product, weight_gradient
-
-__all__ = ["attend_cells", "convolve", "gelu", "matmul", "matmul_bf16", "on_cpu"]
+from rsjax.layers.cpu import matmul as cpu_matmul
 
 
-def on_cpu() -> bool:
-    """Returns whether programs run on a CPU."""
-    return jax.default_backend() == "cpu"
+def by_platform(cpu: Callable[..., Any], accelerator: Callable[..., Any], *operands: Any) -> Any:
+    """Returns ``cpu(*operands)`` in a program for a CPU and ``accelerator(*operands)`` in one for a GPU or TPU."""
+    return jax.lax.platform_dependent(*operands, cpu=cpu, default=accelerator)
 
 
 def matmul(x: Float[Array, "N K"], w: Float[Array, "K M"]) -> Float[Array, "N M"]:
-    """Returns x·w by :func:`matmul_bf16`, or in float32 on CPUs without bf16 units, where this is as fast."""
-    if on_cpu() and not runtime.has_bf16_units():
-        return x @ w
-    return matmul_bf16(x, w)
+    """Returns x·w in the number format of x: operands rounded to bf16, sums in float32, in both passes.
 
-
-@jax.custom_vjp
-def matmul_bf16(x: Float[Array, "N K"], w: Float[Array, "K M"]) -> Float[Array, "N M"]:
-    """Returns x·w: operands rounded to bf16, float32 accumulation, in both passes; float32 in and out.
-
-    The gradient is hand-written because the default one does not round cotangents, and so does not use bf16 units.
+    CPUs without bf16 units multiply in float32, where this is as fast.
     """
-    return product(x.astype(jnp.bfloat16), w.astype(jnp.bfloat16))
-
-
-def _forward(x: Array, w: Array) -> tuple[Array, tuple[Array, Array]]:
-    x = x.astype(jnp.bfloat16)
-    w = w.astype(jnp.bfloat16)
-    return product(x, w), (x, w)
-
-
-def _backward(saved: tuple[Array, Array], cotangent: Array) -> tuple[Array, Array]:
-    x, w = saved
-    cotangent = cotangent.astype(jnp.bfloat16)
-    to_x = product(cotangent, w, 1)
-    if on_cpu():
-        return to_x, weight_gradient(x, cotangent)
-    return to_x, product(x.T, cotangent)
-
-
-matmul_bf16.defvjp(_forward, _backward)
+    return by_platform(cpu_matmul.matmul, accelerator.matmul, x, w)
 
 
 def attend_cells(
@@ -73,14 +49,11 @@ def attend_cells(
     """
     cells = q.shape[-3]
     frames = [x.reshape(-1, *x.shape[-3:]) for x in (q, k, v)]
-    if bf16 and not on_cpu():
-        halves = (x.astype(jnp.bfloat16) for x in frames)
-        out = jax.nn.dot_product_attention(*halves, is_causal=causal).astype(q.dtype)
-    elif bf16 and cells >= frame_attention.LARGE_FRAME:
-        out = frame_attention.attend_in_frames(frames[0], frames[1], frames[2], causal)
-    else:
-        out = attend(frames[0], frames[1], frames[2], jnp.tri(cells, dtype=bool) if causal else None)
-    return out.reshape(q.shape)
+    plain = partial(attend, mask=jnp.tri(cells, dtype=bool) if causal else None)
+    if not bf16:
+        return plain(*frames).reshape(q.shape)
+    on_cpu = plain if cells < frame_attention.LARGE_FRAME else partial(frame_attention.attend_in_frames, causal=causal)
+    return by_platform(on_cpu, partial(accelerator.attend, causal=causal), *frames).reshape(q.shape)
 
 
 def convolve(
@@ -94,12 +67,17 @@ def convolve(
 
     On an accelerator the result is rounded to bf16 too, as in the layers of other libraries.
     """
-    if not on_cpu():
-        x = x.astype(jnp.bfloat16)
-        kernel = kernel.astype(jnp.bfloat16)
-        return jax.lax.conv_general_dilated(x, kernel, window_strides, padding, **settings).astype(jnp.float32)
-    if not convolution.multiplies(x, kernel, window_strides, padding, settings):
-        return jax.lax.conv_general_dilated(x, kernel, window_strides, padding, **settings)
-    if len(kernel) == 1:
-        return matmul_bf16(x.reshape(-1, x.shape[-1]), kernel[0, 0]).reshape(*x.shape[:-1], -1)
-    return convolution.conv_bf16(x, kernel)
+    settings |= {"window_strides": window_strides, "padding": padding}
+    return by_platform(partial(convolution.convolve, **settings), partial(accelerator.convolve, **settings), x, kernel)
+
+
+def convolve_video(
+    frames: Float[Array, "B T h w C"], kernel: Float[Array, "3 3 3 C D"], bf16: bool
+) -> Float[Array, "B T-2 h w D"]:
+    """Returns the 3-D convolution, padded with zeros in space only.
+
+    Args:
+        bf16: whether operands are rounded to bf16, as in :func:`convolve`.
+    """
+    on_cpu = partial(convolution.convolve_video, bf16=bf16)
+    return by_platform(on_cpu, partial(accelerator.convolve_video, bf16=bf16), frames, kernel)

@@ -11,14 +11,12 @@ from functools import partial
 from typing import Any
 
 import flax.linen as nn
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rsjax.layers.convolution import Dtype
 from rsjax.layers.group_norm import GroupNorm
-from rsjax.layers.platform import convolve as convolve_bf16
-from rsjax.layers.platform import on_cpu
+from rsjax.layers.platform import convolve_video
 from rsjax.models.cogvideox.config import DECODED, ENCODED, CausalVAEConfig
 from rsjax.tokenizers.magvit2 import depth_to_space, space_to_depth
 from rsjax.tokenizers.vae_blocks import Downsample, Upsample
@@ -47,26 +45,9 @@ class CausalConv(nn.Module):
         frames = jnp.concatenate([past, x], axis=1)
         if self.is_mutable_collection(PAST):
             self.put_variable(PAST, "frames", frames[:, 1 - SIZE :])
-        return convolve(frames, kernel, self.dtype) + self.param("bias", nn.initializers.zeros, (self.features,))
-
-
-def convolve(frames: Video, kernel: Float[Array, "3 3 3 C D"], dtype: Dtype) -> Video:
-    """Returns the 3-D convolution, padded with zeros in space only, by the fastest implementation on this platform."""
-    around = ((1, 1), (1, 1))
-    if not on_cpu():
-        names = ("NTHWC", "THWIO", "NTHWC")
-        frames = frames.astype(dtype)
-        kernel = kernel.astype(dtype)
-        made = jax.lax.conv_general_dilated(frames, kernel, (1, 1, 1), ((0, 0), *around), dimension_numbers=names)
-        return made.astype(jnp.float32)
-    count = frames.shape[1] - SIZE + 1
-    names = ("NHWC", "HWIO", "NHWC")
-    stacked = jnp.concatenate([frames[:, i : i + count] for i in range(SIZE)], axis=-1)
-    flat = kernel.transpose(1, 2, 0, 3, 4).reshape(SIZE, SIZE, -1, kernel.shape[-1])
-    convolve: Any = jax.lax.conv_general_dilated
-    if dtype == "bfloat16":
-        convolve = convolve_bf16
-    return by_frame(stacked, lambda x: convolve(x, flat, (1, 1), around, dimension_numbers=names))
+        return convolve_video(frames, kernel, self.dtype == "bfloat16") + self.param(
+            "bias", nn.initializers.zeros, (self.features,)
+        )
 
 
 def by_frame(x: Video, function: Any) -> Video:

@@ -16,8 +16,9 @@ from rsjax.clip import Video
 from rsjax.config import TokenizerConfig
 from rsjax.data.depth_color import color_to_depth, depth_to_color
 from rsjax.data.normalization import Normalization
-from rsjax.devices import divide, map_rows, mesh_of
+from rsjax.devices import divide, map_rows, mesh_of, on_cpu
 from rsjax.errors import UserError
+from rsjax.layers.platform import by_platform
 from rsjax.tokenizers.magvit2 import Tokenizer
 from rsjax.trainable import Params
 
@@ -109,7 +110,7 @@ class Codec:
 def images_per_pass(side: int) -> int:
     """Returns how many images of ``side`` × ``side`` pixels one pass takes, over all devices."""
     pixels = PIXELS
-    if jax.default_backend() == "cpu":
+    if on_cpu():
         pixels = CPU_PIXELS * jax.local_device_count()
     return max(1, pixels // side**2)
 
@@ -147,7 +148,7 @@ def passes_at_once() -> int:
 
     Passes on several devices must keep their order.
     """
-    if jax.default_backend() == "cpu" and jax.device_count() == 1:
+    if on_cpu() and jax.device_count() == 1:
         return 2
     return 1
 
@@ -159,6 +160,7 @@ def _run(config: TokenizerConfig, method: str, mesh: Mesh | None, params: Params
     def run(params: Params, images: ArrayLike) -> jax.Array:
         return cast(jax.Array, Tokenizer(config).apply({"params": params}, images, method=method))
 
-    if jax.default_backend() == "cpu":
-        return map_rows(lambda params, image: run(params, image[None])[0], params, x, mesh)
-    return run(params, x)
+    def one_by_one(params: Params, images: ArrayLike) -> jax.Array:
+        return map_rows(lambda params, image: run(params, image[None])[0], params, images, mesh)
+
+    return by_platform(one_by_one, run, params, x)

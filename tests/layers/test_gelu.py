@@ -2,7 +2,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rsjax.layers.platform import gelu
+from rsjax.layers.gelu import gelu
 
 X = jnp.concatenate([jnp.linspace(-12, 12, 1001), jnp.array([0.0, -40.0, 40.0])])
 

@@ -3,7 +3,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rsjax.layers.platform import matmul, matmul_bf16
+from rsjax.layers.cpu.matmul import matmul_bf16
+from rsjax.layers.platform import matmul
 
 
 def rounded(x: np.ndarray) -> np.ndarray:

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, BFloat16, Float
 
 from rsjax import runtime
-from rsjax.layers.cpu.matmul import product, transposed_in_memory
+from rsjax.layers.cpu.matmul import matmul_bf16, product, transposed_in_memory
 
 LEAST = 32  # channels, in and out, from which the products save more time than their copies of the image cost
 WIDE = 128  # channels out from which a product for each row of the kernel is as fast as one product for all rows
@@ -24,12 +24,45 @@ STRIP = 2**20  # numbers in an unfolded strip: 2 MiB
 WRITTEN_OUT = 8  # strips that are computed without a loop; more take longer to compile
 
 
-def multiplies(x: Array, kernel: Array, window_strides: Sequence[int], padding: Any, settings: dict[str, Any]) -> bool:
+def convolve(x: Float[Array, "B h w C"], kernel: Float[Array, "i j C D"], **settings: Any) -> Float[Array, "B h w D"]:
+    """Convolves as ``jax.lax.conv_general_dilated`` does, as products with bf16 operands where these are faster."""
+    if not multiplies(x, kernel, settings):
+        return jax.lax.conv_general_dilated(x, kernel.astype(x.dtype), **settings)
+    if len(kernel) == 1:
+        return matmul_bf16(x.reshape(-1, x.shape[-1]), kernel[0, 0]).reshape(*x.shape[:-1], -1)
+    return conv_bf16(x, kernel)
+
+
+def convolve_video(
+    frames: Float[Array, "B T h w C"], kernel: Float[Array, "3 3 3 C D"], bf16: bool
+) -> Float[Array, "B T-2 h w D"]:
+    """Returns the 3-D convolution, padded with zeros in space only, as one in 2-D of three frames side by side."""
+    size = len(kernel)
+    count = frames.shape[1] - size + 1
+    stacked = jnp.concatenate([frames[:, i : i + count] for i in range(size)], axis=-1)
+    flat = kernel.transpose(1, 2, 0, 3, 4).reshape(size, size, -1, kernel.shape[-1])
+    run = convolve if bf16 else jax.lax.conv_general_dilated
+    out = run(
+        stacked.reshape(-1, *stacked.shape[2:]),
+        flat,
+        window_strides=(1, 1),
+        padding=((1, 1), (1, 1)),
+        dimension_numbers=("NHWC", "HWIO", "NHWC"),
+    )
+    return out.reshape(*stacked.shape[:2], *out.shape[1:])
+
+
+def multiplies(x: Array, kernel: Array, settings: dict[str, Any]) -> bool:
     """Returns whether products compute this convolution, and faster than XLA does."""
     size = len(kernel)
+    padding = settings["padding"]
     around = padding == "SAME" or all(tuple(each) == (size // 2, size // 2) for each in padding)
     square = kernel.shape[1] == size and size % 2 == 1
-    plain = {*window_strides, *(settings.get("lhs_dilation") or ()), *(settings.get("rhs_dilation") or ())} == {1}
+    plain = {
+        *settings["window_strides"],
+        *(settings.get("lhs_dilation") or ()),
+        *(settings.get("rhs_dilation") or ()),
+    } == {1}
     wide = min(kernel.shape[2:]) >= LEAST and kernel.shape[2] == x.shape[-1]
     return around and square and plain and wide and runtime.has_bf16_units()
 

@@ -8,6 +8,38 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, BFloat16, Float
 
+from rsjax import runtime
+
+
+def matmul(x: Float[Array, "N K"], w: Float[Array, "K M"]) -> Float[Array, "N M"]:
+    """Returns x·w by :func:`matmul_bf16`, or in float32 on CPUs without bf16 units, where this is as fast."""
+    if runtime.has_bf16_units():
+        return matmul_bf16(x, w)
+    return (x.astype(jnp.float32) @ w).astype(x.dtype)
+
+
+@jax.custom_vjp
+def matmul_bf16(x: Float[Array, "N K"], w: Float[Array, "K M"]) -> Float[Array, "N M"]:
+    """Returns x·w in the number format of x: operands rounded to bf16, sums in float32, in both passes.
+
+    The gradient is hand-written because the default one does not round cotangents, and so does not use bf16 units.
+    """
+    return product(x.astype(jnp.bfloat16), w.astype(jnp.bfloat16)).astype(x.dtype)
+
+
+def _forward(x: Array, w: Array) -> tuple[Array, tuple[Array, Array]]:
+    w = w.astype(jnp.bfloat16)
+    return matmul_bf16(x, w), (x.astype(jnp.bfloat16), w)
+
+
+def _backward(saved: tuple[Array, Array], cotangent: Array) -> tuple[Array, Array]:
+    x, w = saved
+    rounded = cotangent.astype(jnp.bfloat16)
+    return product(rounded, w, 1).astype(cotangent.dtype), weight_gradient(x, rounded)
+
+
+matmul_bf16.defvjp(_forward, _backward)
+
 
 def product(x: Float[Array, "N K"], w: Float[Array, "..."], contract: int = 0) -> Float[Array, "N M"]:
     """Returns x·w in float32, contracting axis ``contract`` of w."""

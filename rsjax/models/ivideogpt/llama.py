@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Int, Key
 from rsjax.config import ClipShape
 from rsjax.layers.attention import KeyValues, attend_parts, put_frames, rotate
 from rsjax.layers.dense import Dense
-from rsjax.layers.platform import attend_cells, on_cpu
+from rsjax.layers.platform import attend_cells
 from rsjax.layers.unstacked_params import together
 from rsjax.models.ivideogpt.config import IVideoGPTConfig
 from rsjax.models.ivideogpt.sequence import Layout
@@ -101,9 +101,7 @@ def _attend_with_dropout(
     keys: Key[Array, " B"],
     config: IVideoGPTConfig,
 ) -> Float[Array, "B L h e"]:
-    """Returns causal softmax(q·kᵀ/√e)·v with dropout of the weights; products as in :func:`attend_cells`."""
-    if config.compute_dtype == "bfloat16" and not on_cpu():
-        q, k, v = (x.astype(jnp.bfloat16) for x in (q, k, v))
+    """Returns causal softmax(q·kᵀ/√e)·v with dropout of the weights."""
     scores = jnp.einsum("bqhe,bkhe->bhqk", q, k, preferred_element_type=jnp.float32) * q.shape[-1] ** -0.5
     weights = jax.nn.softmax(jnp.where(jnp.tri(q.shape[1], dtype=bool), scores, jnp.finfo(jnp.float32).min), axis=-1)
     keep = jax.vmap(lambda key: jax.random.bernoulli(key, 1 - config.dropout, weights.shape[1:]))(keys)

@@ -21,6 +21,7 @@ from jaxtyping import Array, Float, Float32, Int, UInt8
 from rsjax.clip import Video
 from rsjax.config import SampleConfig, TokenizerConfig, TokenModelConfig
 from rsjax.data.normalization import with_sums
+from rsjax.devices import on_cpu
 from rsjax.models.branch_states import BranchState, Decoding
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.departures import mean_codes
@@ -178,7 +179,9 @@ class TokenBranching:
 
 def program_clips(lanes: int) -> int:
     """Returns how many clips one run of the program generates."""
-    return 1 if jax.default_backend() == "cpu" else lanes
+    if on_cpu():
+        return 1
+    return lanes
 
 
 def _means(arch: Architecture, sample: SampleConfig, state: State) -> mean_codes.Means:

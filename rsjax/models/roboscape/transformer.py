@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rsjax.layers.attention import KeyValues, put_frames
 from rsjax.layers.dense import PRODUCT, Dense
-from rsjax.layers.platform import gelu
+from rsjax.layers.gelu import gelu
 from rsjax.layers.unstacked_params import together
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.attention import Attention

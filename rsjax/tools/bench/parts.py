@@ -21,6 +21,7 @@ from rsjax.data import loader
 from rsjax.data.curriculum import plan
 from rsjax.data.loader import Prefetch
 from rsjax.data.store import open_store, write_store
+from rsjax.devices import on_cpu
 from rsjax.errors import UserError
 from rsjax.models.base import create_autoencoder, create_model
 from rsjax.models.roboscape.model import RoboScape
@@ -53,7 +54,7 @@ MOST = 200  # steps of the part "feed"
 def matmul(dtype: str, budget: float) -> Numbers:
     """Measures matrix products with float32 accumulation; the ceiling is the fastest rate in operations a second."""
     shapes = ACCELERATOR_PRODUCTS
-    if jax.default_backend() == "cpu":
+    if on_cpu():
         shapes = CPU_PRODUCTS
     product = jax.jit(lambda x, w: jnp.matmul(x, w, preferred_element_type=jnp.float32))
     rates = {}

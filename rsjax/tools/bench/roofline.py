@@ -23,7 +23,8 @@ from jax.extend.core import jaxprs_in_params
 from rsjax.config import Config, TokenizerConfig
 from rsjax.layers.attention import attend
 from rsjax.layers.dense import Dense, layer_norm
-from rsjax.layers.platform import attend_cells, convolve, gelu
+from rsjax.layers.gelu import gelu
+from rsjax.layers.platform import attend_cells, convolve
 from rsjax.models.base import create_model
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.flops import forward_flops

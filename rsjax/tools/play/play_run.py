@@ -16,6 +16,7 @@ from rsjax.config import SimConfig, from_dict
 from rsjax.data.clips import frame_rate
 from rsjax.data.codec import Record
 from rsjax.data.store import Source, Store, StoreError
+from rsjax.devices import on_cpu
 from rsjax.errors import UserError, first_line
 from rsjax.models.trained import TrainedModel
 from rsjax.tools.play.controls import Controls, controls_of_run
@@ -172,5 +173,5 @@ class PlayRun:
             "clips": self.clips,
             "missing": self.missing,
             "source": str(self.store.manifest.get("source") or "") if self.store else "",
-            "device": jax.devices()[0].device_kind if jax.default_backend() != "cpu" else "cpu",
+            "device": "cpu" if on_cpu() else jax.devices()[0].device_kind,
         }

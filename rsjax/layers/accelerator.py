@@ -1,0 +1,66 @@
+"""What GPUs and TPUs compute where CPUs need something else; :mod:`rsjax.layers.platform` decides where it is used.
+
+Axes: N rows, frames or sequences, S cells, h heads, e head width; B images, T frames, h×w cells, C and D channels,
+i×j a kernel.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+
+@jax.custom_vjp
+def matmul(x: Float[Array, "N K"], w: Float[Array, "K M"]) -> Float[Array, "N M"]:
+    """Returns x·w in the number format of x: operands rounded to bf16, sums in float32, in both passes.
+
+    The gradient is hand-written because the default one does not round cotangents; that of the weights is float32.
+    """
+    return _product(x, w, (1, 0), x.dtype)
+
+
+def _matmul_forward(x: Array, w: Array) -> tuple[Array, tuple[Array, Array]]:
+    return matmul(x, w), (x.astype(jnp.bfloat16), w)
+
+
+def _matmul_backward(saved: tuple[Array, Array], cotangent: Array) -> tuple[Array, Array]:
+    x, w = saved
+    return _product(cotangent, w, (1, 1), cotangent.dtype), _product(x, cotangent, (0, 0), jnp.float32)
+
+
+def _product(x: Array, y: Array, contract: tuple[int, int], dtype: Any) -> Array:
+    axes = (((contract[0],), (contract[1],)), ((), ()))
+    return jax.lax.dot_general(x.astype(jnp.bfloat16), y.astype(jnp.bfloat16), axes, preferred_element_type=dtype)
+
+
+matmul.defvjp(_matmul_forward, _matmul_backward)
+
+
+def attend(
+    q: Float[Array, "N S h e"], k: Float[Array, "N S h e"], v: Float[Array, "N S h e"], causal: bool
+) -> Float[Array, "N S h e"]:
+    """Returns softmax(q·kᵀ/√e)·v with operands rounded to bf16, in the number format of q."""
+    halves = (x.astype(jnp.bfloat16) for x in (q, k, v))
+    return jax.nn.dot_product_attention(*halves, is_causal=causal).astype(q.dtype)
+
+
+def convolve(x: Float[Array, "B h w C"], kernel: Float[Array, "i j C D"], **settings: Any) -> Float[Array, "B h w D"]:
+    """Convolves operands that are rounded to bf16; the result is rounded too, and has the number format of x."""
+    halves = (y.astype(jnp.bfloat16) for y in (x, kernel))
+    return jax.lax.conv_general_dilated(*halves, **settings).astype(x.dtype)
+
+
+def convolve_video(
+    frames: Float[Array, "B T h w C"], kernel: Float[Array, "3 3 3 C D"], bf16: bool
+) -> Float[Array, "B T-2 h w D"]:
+    """Returns the 3-D convolution, padded with zeros in space only."""
+    dtype = jnp.bfloat16 if bf16 else frames.dtype
+    out = jax.lax.conv_general_dilated(
+        frames.astype(dtype),
+        kernel.astype(dtype),
+        window_strides=(1, 1, 1),
+        padding=((0, 0), (1, 1), (1, 1)),
+        dimension_numbers=("NTHWC", "THWIO", "NTHWC"),
+    )
+    return out.astype(frames.dtype)

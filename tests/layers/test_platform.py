@@ -1,0 +1,53 @@
+"""Each function of the door: the platform of a program decides its code, and both implementations agree."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rsjax.layers import accelerator, platform
+from rsjax.layers.cpu.matmul import matmul_bf16
+
+CONVOLUTION = {"window_strides": (1, 1), "padding": "SAME", "dimension_numbers": ("NHWC", "HWIO", "NHWC")}
+
+
+def numbers(*shape: int) -> jax.Array:
+    return jnp.asarray(np.random.default_rng(0).normal(size=shape), jnp.float32)
+
+
+DOORS: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {
+    "matmul": (platform.matmul, (numbers(6, 32), numbers(32, 4))),
+    "attend_cells": (lambda x: platform.attend_cells(x, x, x, bf16=True), (numbers(1, 128, 2, 8),)),
+    "convolve": (lambda x, w: platform.convolve(x, w, **CONVOLUTION), (numbers(1, 6, 6, 32), numbers(3, 3, 32, 32))),  # type: ignore[arg-type]
+    "convolve_video": (
+        lambda x, w: platform.convolve_video(x, w, bf16=True),
+        (numbers(1, 4, 6, 6, 32), numbers(3, 3, 3, 32, 32)),
+    ),
+}
+
+
+def lowered(run: Callable[..., Any], operands: tuple[Any, ...], target: str) -> str:
+    return jax.jit(run).trace(*operands).lower(lowering_platforms=(target,)).as_text()
+
+
+@pytest.mark.usefixtures("bf16_units")
+@pytest.mark.parametrize("name", DOORS)
+def test_a_program_for_a_gpu_or_tpu_is_the_same_wherever_it_is_lowered_and_not_the_cpu_s(name: str) -> None:
+    run, operands = DOORS[name]
+    programs = {target: lowered(run, operands, target) for target in ("cpu", "cuda", "tpu")}
+    assert programs["cuda"] == programs["tpu"] != programs["cpu"]
+
+
+@pytest.mark.usefixtures("bf16_units")
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.bfloat16])
+def test_both_products_have_the_same_values_gradients_and_number_formats(dtype: Any) -> None:
+    operands = (numbers(6, 32).astype(dtype), numbers(32, 4))
+    found, pull = jax.vjp(matmul_bf16, *operands)
+    expected, other_pull = jax.vjp(accelerator.matmul, *operands)
+    cotangent = numbers(6, 4).astype(dtype)
+    for x, y in zip((found, *pull(cotangent)), (expected, *other_pull(cotangent)), strict=True):
+        assert x.dtype == y.dtype
+        np.testing.assert_allclose(x.astype(jnp.float32), y.astype(jnp.float32), rtol=0.01, atol=0.01)
