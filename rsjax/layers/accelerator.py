@@ -47,8 +47,8 @@ def attend(
 
 def convolve(x: Float[Array, "B h w C"], kernel: Float[Array, "i j C D"], **settings: Any) -> Float[Array, "B h w D"]:
     """Convolves operands that are rounded to bf16; the result is rounded too, and has the number format of x."""
-    halves = (y.astype(jnp.bfloat16) for y in (x, kernel))
-    return jax.lax.conv_general_dilated(*halves, **settings).astype(x.dtype)
+    out = jax.lax.conv_general_dilated(x.astype(jnp.bfloat16), kernel.astype(jnp.bfloat16), **settings)
+    return out.astype(x.dtype)
 
 
 def convolve_video(

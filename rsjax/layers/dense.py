@@ -1,6 +1,9 @@
 """Linear layers and LayerNorm as in the public PyTorch code."""
 
+from typing import Any
+
 import flax.linen as nn
+import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float
 
@@ -12,9 +15,9 @@ PRODUCT = "product"  # the name of linear layers' outputs in rematerialisation p
 
 
 class Dense(nn.Module):
-    """A linear layer with float32 parameters; with ``bf16`` it multiplies in bf16 and accumulates in float32.
+    """A linear layer with float32 parameters, whose output has the number format of its input.
 
-    Where there are no bf16 units, it multiplies in float32 even then.
+    With ``bf16`` it rounds operands to bf16 and adds up in float32 (:func:`rsjax.layers.platform.matmul`).
     """
 
     features: int
@@ -31,10 +34,10 @@ class Dense(nn.Module):
             out = x @ kernel
         out = checkpoint_name(out, PRODUCT)
         if self.use_bias:
-            return out + self.param("bias", nn.initializers.zeros, (self.features,))
+            out = (out + self.param("bias", nn.initializers.zeros, (self.features,))).astype(x.dtype)
         return out
 
 
-def layer_norm(name: str | None) -> nn.LayerNorm:
-    """Returns a float32 LayerNorm with torch's epsilon."""
-    return nn.LayerNorm(epsilon=1e-5, name=name)
+def layer_norm(name: str | None, dtype: Any = jnp.float32) -> nn.LayerNorm:
+    """Returns a LayerNorm with torch's epsilon and float32 statistics, whose output has this number format."""
+    return nn.LayerNorm(epsilon=1e-5, dtype=dtype, name=name)

@@ -11,8 +11,12 @@ _DENSITY = float(1 / np.sqrt(2 * np.pi))  # of the normal distribution at 0
 
 @jax.custom_vjp
 def gelu(x: Float[Array, "*N"]) -> Float[Array, "*N"]:
-    """Returns the exact GELU x·Φ(x), with Φ by erf as torch computes it; XLA's erfc takes three times as long."""
-    return x * _share(x)
+    """Returns the exact GELU x·Φ(x), with Φ by erf as torch computes it; XLA's erfc takes three times as long.
+
+    It is computed in float32 and has the number format of x.
+    """
+    wide = x.astype(jnp.float32)
+    return (wide * _share(wide)).astype(x.dtype)
 
 
 def _share(x: Array) -> Array:
@@ -26,7 +30,9 @@ def _forward(x: Array) -> tuple[Array, Array]:
 
 def _backward(x: Array, cotangent: Array) -> tuple[Array]:
     # Recomputed from x: what the forward pass would store is as large as x.
-    return (cotangent * (_share(x) + x * jnp.exp(-0.5 * jnp.square(x)) * _DENSITY),)
+    wide = x.astype(jnp.float32)
+    slope = _share(wide) + wide * jnp.exp(-0.5 * jnp.square(wide)) * _DENSITY
+    return ((cotangent * slope).astype(x.dtype),)
 
 
 gelu.defvjp(_forward, _backward)

@@ -45,9 +45,8 @@ class CausalConv(nn.Module):
         frames = jnp.concatenate([past, x], axis=1)
         if self.is_mutable_collection(PAST):
             self.put_variable(PAST, "frames", frames[:, 1 - SIZE :])
-        return convolve_video(frames, kernel, self.dtype == "bfloat16") + self.param(
-            "bias", nn.initializers.zeros, (self.features,)
-        )
+        bias = self.param("bias", nn.initializers.zeros, (self.features,))
+        return convolve_video(frames, kernel, self.dtype == "bfloat16") + bias
 
 
 def by_frame(x: Video, function: Any) -> Video:

@@ -27,7 +27,7 @@ class Attention(nn.Module):
         self.qkv = Dense(3 * cfg.width, bf16, use_bias=False)
         self.proj = Dense(cfg.width, bf16)
         if cfg.public.qk_norm:
-            self.norm = layer_norm(None)
+            self.norm = layer_norm(None, cfg.feature_dtype)
 
     def spatial(self, x: Float[Array, "B T S C"]) -> Float[Array, "B T S C"]:
         """Lets every cell attend to all cells of its frame."""
@@ -68,7 +68,7 @@ class Attention(nn.Module):
         q = self._head_major(q)
         new = KeyValues(self._head_major(k), self._head_major(v))
         sees = (self._sees(positions, frames_held(slots, start - 1)), self._sees(positions, positions))
-        out = attend_few(q, [(cache, sees[0]), (new, sees[1])]).transpose(0, 3, 1, 2, 4)
+        out = attend_few(q, [(cache, sees[0]), (new, sees[1])]).transpose(0, 3, 1, 2, 4).astype(x.dtype)
         return self.proj(out.reshape(x.shape)), new
 
     def _head_major(self, x: Float[Array, "B T S C"]) -> Float[Array, "B S h T e"]:

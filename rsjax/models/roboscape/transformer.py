@@ -175,6 +175,8 @@ class Transformer(nn.Module):
                 absent = absent_cells(branch, before, start, no_depth)
                 x[branch] = x[branch] + TokenEmbed(cfg, name=f"{branch}_previous_embed")(before, absent)
 
+        x = {branch: features.astype(cfg.feature_dtype) for branch, features in x.items()}
+
         # Both branches' blocks, with Eq. 3 after each pair.
         blocks = nn.scan(
             _rematerialised(cfg),
@@ -224,7 +226,7 @@ class Transformer(nn.Module):
             x = x / (cfg.width / MUP_WIDTH)
         bf16 = cfg.compute_dtype == "bfloat16"
         logits = Dense(cfg.vocabularies * cfg.vocabulary_size, bf16, name=f"{branch}_head")(x)
-        return logits.reshape(*x.shape[:-1], cfg.vocabularies, cfg.vocabulary_size)
+        return logits.astype(jnp.float32).reshape(*x.shape[:-1], cfg.vocabularies, cfg.vocabulary_size)
 
     def init_params(self, key: Array) -> Params:
         """Returns fresh parameters; blocks are stacked along a leading axis."""

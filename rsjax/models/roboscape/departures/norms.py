@@ -12,4 +12,4 @@ def optional_norm(is_on: bool, name: str, x: Float[Array, "*N C"]) -> Float[Arra
     """Returns the features, normalised by a LayerNorm called ``name`` if ``is_on``."""
     if not is_on:
         return x
-    return layer_norm(name)(x)
+    return layer_norm(name, x.dtype)(x)
