@@ -41,6 +41,18 @@ def attend(
     return jnp.einsum("...hqk,...khe->...qhe", jax.nn.softmax(scores, axis=-1).astype(v.dtype), v)
 
 
+def packed(
+    q: Float[Array, "B T S h e"], k: Float[Array, "B T S h e"], v: Float[Array, "B T S h e"]
+) -> Float[Array, "B T S 3 h e"]:
+    """Puts queries, keys and values side by side, as their projection returns them."""
+    return jnp.stack([q, k.astype(q.dtype), v.astype(q.dtype)], axis=-3)
+
+
+def unpacked(qkv: Float[Array, "B T S 3 h e"]) -> tuple[Float[Array, "B T S h e"], ...]:
+    """Returns queries, keys and values of their projection."""
+    return tuple(qkv[..., i, :, :] for i in range(3))
+
+
 def attend_parts(
     q: Float[Array, "*N q e"], parts: Sequence[tuple[KeyValues, Bool[Array, "q k"]]]
 ) -> Float[Array, "*N q e"]:
@@ -81,7 +93,7 @@ def rotate(x: Float[Array, "B T S h e"], positions: Int[Array, " T"]) -> Float[A
     angles = positions[:, None] * 10_000.0 ** (-jnp.arange(half) / half)
     cos, sin = (f(angles)[:, None, None] for f in (jnp.cos, jnp.sin))
     first, second = jnp.split(x, 2, axis=-1)
-    return jnp.concatenate([first * cos - second * sin, second * cos + first * sin], axis=-1)
+    return jnp.concatenate([first * cos - second * sin, second * cos + first * sin], axis=-1).astype(x.dtype)
 
 
 def frames_held(slots: int, last: Int[Array, ""] | int) -> Int[Array, " slots"]:

@@ -9,21 +9,44 @@ i×j a kernel.
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rsjax.layers import accelerator
-from rsjax.layers.attention import attend
+from rsjax.layers.attention import attend, unpacked
 from rsjax.layers.cpu import convolution, frame_attention
 from rsjax.layers.cpu import matmul as cpu_matmul
+from rsjax.layers.gpu import attention as gpu
 
 
 def by_platform(cpu: Callable[..., Any], accelerator: Callable[..., Any], *operands: Any) -> Any:
     """Returns ``cpu(*operands)`` in a program for a CPU and ``accelerator(*operands)`` in one for a GPU or TPU."""
     return jax.lax.platform_dependent(*operands, cpu=cpu, default=accelerator)
+
+
+def attend_in_clip(
+    qkv: Float[Array, "B T S 3 h e"], over: Literal["cells", "frames"], bf16: bool
+) -> Float[Array, "B T S h e"]:
+    """Returns softmax(q·kᵀ/√e)·v among the cells of each frame, or of each cell over the frames up to its own.
+
+    Args:
+        qkv: queries, keys and values as their projection returns them; GPUs and TPUs read them in place.
+        bf16: whether products may round their operands to bf16.
+    """
+
+    def plain(qkv: Array) -> Array:
+        q, k, v = unpacked(qkv)
+        if over == "cells":
+            return attend_cells(q, k, v, bf16)
+        q, k, v = (x.swapaxes(1, 2) for x in (q, k, v))
+        return attend(q, k, v, jnp.tri(q.shape[-3], dtype=bool)).swapaxes(1, 2)
+
+    if qkv.dtype == jnp.float32 or not gpu.fits(qkv.shape, over):
+        return plain(qkv)
+    return jax.lax.platform_dependent(qkv, cuda=partial(gpu.attend, over=over), default=plain)
 
 
 def matmul(x: Float[Array, "N K"], w: Float[Array, "K M"]) -> Float[Array, "N M"]:
@@ -52,7 +75,12 @@ def attend_cells(
     plain = partial(attend, mask=jnp.tri(cells, dtype=bool) if causal else None)
     if not bf16:
         return plain(*frames).reshape(q.shape)
-    on_cpu = plain if cells < frame_attention.LARGE_FRAME else partial(frame_attention.attend_in_frames, causal=causal)
+
+    def on_cpu(*frames: Array) -> Array:
+        if cells < frame_attention.LARGE_FRAME:
+            return plain(*frames)
+        return frame_attention.attend_in_frames(*(x.astype(jnp.float32) for x in frames), causal).astype(q.dtype)
+
     return by_platform(on_cpu, partial(accelerator.attend, causal=causal), *frames).reshape(q.shape)
 
 

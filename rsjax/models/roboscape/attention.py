@@ -9,9 +9,9 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from rsjax.layers.attention import KeyValues, attend, attend_few, frames_held
+from rsjax.layers.attention import KeyValues, attend, attend_few, frames_held, packed, unpacked
 from rsjax.layers.dense import Dense, layer_norm
-from rsjax.layers.platform import attend_cells
+from rsjax.layers.platform import attend_in_clip
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.departures.rotary import rotated
 
@@ -31,8 +31,8 @@ class Attention(nn.Module):
 
     def spatial(self, x: Float[Array, "B T S C"]) -> Float[Array, "B T S C"]:
         """Lets every cell attend to all cells of its frame."""
-        q, k, v = (self._heads(y) for y in self._project(x))
-        return self.proj(attend_cells(q, k, v, self.config.compute_dtype == "bfloat16").reshape(x.shape))
+        out = attend_in_clip(self._project(x), "cells", self.config.compute_dtype == "bfloat16")
+        return self.proj(out.reshape(x.shape))
 
     def temporal(
         self, x: Float[Array, "B T S C"], start: Any = 0, cache: KeyValues | None = None
@@ -54,38 +54,41 @@ class Attention(nn.Module):
             ValueError: x has more frames than the cache.
         """
         cfg = self.config
-        q, k, v = self._project(x)
+        qkv = self._project(x)
         positions = start + jnp.arange(x.shape[1])
-        q, k = (rotated(cfg.departures, self._heads(y), positions).reshape(y.shape) for y in (q, k))
+        qkv = rotated(cfg.departures, qkv, positions)
+        if cache is None and x.shape[1] <= cfg.frames:
+            out = attend_in_clip(qkv, "frames", cfg.compute_dtype == "bfloat16")
+            return self.proj(out.reshape(x.shape)), None
+        q, k, v = unpacked(qkv)
         if cache is None:
-            q, k, v = (self._heads(y.swapaxes(1, 2)) for y in (q, k, v))
+            q, k, v = (y.swapaxes(1, 2) for y in (q, k, v))
             out = attend(q, k, v, self._sees(positions, positions)).swapaxes(1, 2)
             return self.proj(out.reshape(x.shape)), None
         frames = x.shape[1]
         slots = cache.k.shape[-2]
         if frames > slots:
             raise ValueError(f"{frames} frames do not fit a cache of {slots}")
-        q = self._head_major(q)
-        new = KeyValues(self._head_major(k), self._head_major(v))
+        q, k, v = (y.transpose(0, 2, 3, 1, 4) for y in (q, k, v))  # B S h T e
+        new = KeyValues(k, v)
         sees = (self._sees(positions, frames_held(slots, start - 1)), self._sees(positions, positions))
         out = attend_few(q, [(cache, sees[0]), (new, sees[1])]).transpose(0, 3, 1, 2, 4).astype(x.dtype)
         return self.proj(out.reshape(x.shape)), new
-
-    def _head_major(self, x: Float[Array, "B T S C"]) -> Float[Array, "B S h T e"]:
-        return self._heads(x).transpose(0, 2, 3, 1, 4)
 
     def _sees(self, queries: Int[Array, " q"], keys: Int[Array, " k"]) -> Bool[Array, "q k"]:
         age = queries[:, None] - keys[None, :]
         return (age >= 0) & (age < self.config.frames) & (keys >= 0)
 
-    def _project(self, x: Float[Array, "*N C"]) -> tuple[Float[Array, "*N C"], ...]:
-        q, k, v = jnp.split(self.qkv(x), 3, axis=-1)
-        if self.config.public.qk_norm:
-            q, k = (self.norm(self._heads(y)).reshape(y.shape) for y in (q, k))
-        if self.config.public.mup:
+    def _project(self, x: Float[Array, "B T S C"]) -> Float[Array, "B T S 3 h e"]:
+        cfg = self.config
+        qkv = self.qkv(x).reshape(*x.shape[:-1], 3, cfg.heads, cfg.head_width)
+        if not (cfg.public.qk_norm or cfg.public.mup):
+            return qkv
+        q, k, v = unpacked(qkv)
+        if cfg.public.qk_norm:
+            q = self.norm(q)
+            k = self.norm(k)
+        if cfg.public.mup:
             # Together with attend's 1/√e this scales by 8/e, after the norm as in the public code.
-            q = q * (8 * self.config.head_width**-0.5)
-        return q, k, v
-
-    def _heads(self, x: Float[Array, "*N C"]) -> Float[Array, "*N h e"]:
-        return x.reshape(*x.shape[:-1], self.config.heads, self.config.head_width)
+            q = q * (8 * cfg.head_width**-0.5)
+        return packed(q, k, v)

@@ -6,13 +6,14 @@ The public code learns an embedding for each frame; positions within a frame are
 from jaxtyping import Array, Float, Int
 
 from rsjax.config import Departures
-from rsjax.layers.attention import rotate
+from rsjax.layers.attention import packed, rotate, unpacked
 
 
 def rotated(
-    departures: Departures, x: Float[Array, "B T S h e"], positions: Int[Array, " T"]
-) -> Float[Array, "B T S h e"]:
-    """Returns temporal queries or keys, rotated by the positions of their frames if ``rotary`` is on."""
+    departures: Departures, qkv: Float[Array, "B T S 3 h e"], positions: Int[Array, " T"]
+) -> Float[Array, "B T S 3 h e"]:
+    """Rotates temporal queries and keys by the positions of their frames if ``rotary`` is on."""
     if not departures.rotary:
-        return x
-    return rotate(x, positions)
+        return qkv
+    q, k, v = unpacked(qkv)
+    return packed(rotate(q, positions), rotate(k, positions), v)
