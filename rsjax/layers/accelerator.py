@@ -12,21 +12,25 @@ from jaxtyping import Array, Float
 
 
 @jax.custom_vjp
-def matmul(x: Float[Array, "N K"], w: Float[Array, "K M"]) -> Float[Array, "N M"]:
-    """Returns x·w in the number format of x: operands rounded to bf16, sums in float32, in both passes.
+def linear(x: Float[Array, "N K"], w: Float[Array, "K M"], bias: Float[Array, " M"] | None) -> Float[Array, "N M"]:
+    """Returns x·w + bias in the number format of x: operands rounded to bf16, products added up in float32.
 
-    The gradient is hand-written because the default one does not round cotangents; that of the weights is float32.
+    The gradient is hand-written because the default one does not round cotangents, and adds those of the bias up in
+    bf16. Gradients of weights and bias are float32. The bias is added in the format of x, which cuBLAS does in the
+    product's own kernel.
     """
-    return _product(x, w, (1, 0), x.dtype)
+    out = _product(x, w, (1, 0), x.dtype)
+    return out if bias is None else out + bias.astype(x.dtype)
 
 
-def _matmul_forward(x: Array, w: Array) -> tuple[Array, tuple[Array, Array]]:
-    return matmul(x, w), (x.astype(jnp.bfloat16), w)
+def _linear_forward(x: Array, w: Array, bias: Array | None) -> tuple[Array, tuple[Array, Array, Array | None]]:
+    return linear(x, w, bias), (x.astype(jnp.bfloat16), w, bias)
 
 
-def _matmul_backward(saved: tuple[Array, Array], cotangent: Array) -> tuple[Array, Array]:
-    x, w = saved
-    return _product(cotangent, w, (1, 1), cotangent.dtype), _product(x, cotangent, (0, 0), jnp.float32)
+def _linear_backward(saved: tuple[Array, Array, Array | None], cotangent: Array) -> tuple[Array, Array, Array | None]:
+    x, w, bias = saved
+    to_bias = None if bias is None else jnp.sum(cotangent.astype(jnp.float32), axis=0)
+    return _product(cotangent, w, (1, 1), cotangent.dtype), _product(x, cotangent, (0, 0), jnp.float32), to_bias
 
 
 def _product(x: Array, y: Array, contract: tuple[int, int], dtype: Any) -> Array:
@@ -34,7 +38,7 @@ def _product(x: Array, y: Array, contract: tuple[int, int], dtype: Any) -> Array
     return jax.lax.dot_general(x.astype(jnp.bfloat16), y.astype(jnp.bfloat16), axes, preferred_element_type=dtype)
 
 
-matmul.defvjp(_matmul_forward, _matmul_backward)
+linear.defvjp(_linear_forward, _linear_backward)
 
 
 def attend(

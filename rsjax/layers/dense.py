@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float
 
-from rsjax.layers.platform import matmul
+from rsjax.layers.platform import linear
 
 # torch's default for linear layers, U(±1/√fan_in), as in the public code.
 TORCH_KERNEL = nn.initializers.variance_scaling(1 / 3, "fan_in", "uniform")
@@ -17,7 +17,7 @@ PRODUCT = "product"  # the name of linear layers' outputs in rematerialisation p
 class Dense(nn.Module):
     """A linear layer with float32 parameters, whose output has the number format of its input.
 
-    With ``bf16`` it rounds operands to bf16 and adds up in float32 (:func:`rsjax.layers.platform.matmul`).
+    With ``bf16`` it rounds operands to bf16 and adds up in float32 (:func:`rsjax.layers.platform.linear`).
     """
 
     features: int
@@ -28,14 +28,12 @@ class Dense(nn.Module):
     @nn.compact
     def __call__(self, x: Float[Array, "*N K"]) -> Float[Array, "*N M"]:
         kernel = self.param("kernel", self.kernel_init, (x.shape[-1], self.features))
+        bias = self.param("bias", nn.initializers.zeros, (self.features,)) if self.use_bias else None
         if self.bf16:
-            out = matmul(x.reshape(-1, x.shape[-1]), kernel).reshape(*x.shape[:-1], self.features)
+            out = linear(x.reshape(-1, x.shape[-1]), kernel, bias).reshape(*x.shape[:-1], self.features)
         else:
-            out = x @ kernel
-        out = checkpoint_name(out, PRODUCT)
-        if self.use_bias:
-            out = (out + self.param("bias", nn.initializers.zeros, (self.features,))).astype(x.dtype)
-        return out
+            out = x @ kernel if bias is None else x @ kernel + bias
+        return checkpoint_name(out, PRODUCT)
 
 
 def layer_norm(name: str | None, dtype: Any = jnp.float32) -> nn.LayerNorm:

@@ -49,12 +49,14 @@ def attend_in_clip(
     return jax.lax.platform_dependent(qkv, cuda=partial(gpu.attend, over=over), default=plain)
 
 
-def matmul(x: Float[Array, "N K"], w: Float[Array, "K M"]) -> Float[Array, "N M"]:
-    """Returns x·w in the number format of x: operands rounded to bf16, sums in float32, in both passes.
+def linear(
+    x: Float[Array, "N K"], w: Float[Array, "K M"], bias: Float[Array, " M"] | None = None
+) -> Float[Array, "N M"]:
+    """Returns x·w + bias in the number format of x: operands rounded to bf16, products added up in float32.
 
     CPUs without bf16 units multiply in float32, where this is as fast.
     """
-    return by_platform(cpu_matmul.matmul, accelerator.matmul, x, w)
+    return by_platform(cpu_matmul.linear, accelerator.linear, x, w, bias)
 
 
 def attend_cells(

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rsjax.layers.cpu.matmul import matmul_bf16
-from rsjax.layers.platform import matmul
+from rsjax.layers.platform import linear
 
 
 def rounded(x: np.ndarray) -> np.ndarray:
@@ -37,4 +37,4 @@ def test_a_processor_without_bf16_units_multiplies_in_float32(monkeypatch: pytes
     monkeypatch.setattr("rsjax.runtime.has_bf16_units", lambda: units)
     rng = np.random.default_rng(0)
     x, w = (jnp.asarray(rng.normal(size=shape), jnp.float32) for shape in ((7, 33), (33, 5)))
-    np.testing.assert_array_equal(matmul(x, w), matmul_bf16(x, w) if units else x @ w)
+    np.testing.assert_array_equal(linear(x, w), matmul_bf16(x, w) if units else x @ w)

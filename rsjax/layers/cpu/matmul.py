@@ -11,11 +11,10 @@ from jaxtyping import Array, BFloat16, Float
 from rsjax import runtime
 
 
-def matmul(x: Float[Array, "N K"], w: Float[Array, "K M"]) -> Float[Array, "N M"]:
-    """Returns x·w by :func:`matmul_bf16`, or in float32 on CPUs without bf16 units, where this is as fast."""
-    if runtime.has_bf16_units():
-        return matmul_bf16(x, w)
-    return (x.astype(jnp.float32) @ w).astype(x.dtype)
+def linear(x: Float[Array, "N K"], w: Float[Array, "K M"], bias: Float[Array, " M"] | None) -> Float[Array, "N M"]:
+    """Returns x·w + bias by :func:`matmul_bf16`, or in float32 on CPUs without bf16 units, where this is as fast."""
+    out = matmul_bf16(x, w) if runtime.has_bf16_units() else x.astype(jnp.float32) @ w
+    return (out if bias is None else out + bias).astype(x.dtype)
 
 
 @jax.custom_vjp
