@@ -209,7 +209,13 @@ def _full_size(name: str, model: RoboScapeConfig | GenieConfig) -> Config:
             entropy_group=8,
             adversarial=AdversarialConfig(),
         ),
-        model=replace(model, compute_dtype="bfloat16", feature_dtype="bfloat16", remat="blocks"),
+        model=replace(
+            model,
+            compute_dtype="bfloat16",
+            feature_dtype="bfloat16",
+            remat="blocks",
+            sample=SampleConfig(cache_dtype="bfloat16"),
+        ),
         train=TrainConfig(
             steps=127_000,
             curriculum=simple_then_difficult if isinstance(model, RoboScapeConfig) else (),

@@ -20,7 +20,9 @@ def linear(x: Float[Array, "N K"], w: Float[Array, "K M"], bias: Float[Array, " 
     product's own kernel.
     """
     out = _product(x, w, (1, 0), x.dtype)
-    return out if bias is None else out + bias.astype(x.dtype)
+    if bias is None:
+        return out
+    return out + bias.astype(x.dtype)
 
 
 def _linear_forward(x: Array, w: Array, bias: Array | None) -> tuple[Array, tuple[Array, Array, Array | None]]:

@@ -13,8 +13,11 @@ from rsjax import runtime
 
 def linear(x: Float[Array, "N K"], w: Float[Array, "K M"], bias: Float[Array, " M"] | None) -> Float[Array, "N M"]:
     """Returns x·w + bias by :func:`matmul_bf16`, or in float32 on CPUs without bf16 units, where this is as fast."""
-    out = matmul_bf16(x, w) if runtime.has_bf16_units() else x.astype(jnp.float32) @ w
-    return (out if bias is None else out + bias).astype(x.dtype)
+    multiply = matmul_bf16 if runtime.has_bf16_units() else jnp.matmul
+    out = multiply(x, w)
+    if bias is not None:
+        out = out + bias
+    return out.astype(x.dtype)
 
 
 @jax.custom_vjp
