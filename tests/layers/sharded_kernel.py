@@ -8,7 +8,7 @@ import json
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array
 
 from rsjax.layers.gpu.attention import attend
@@ -21,14 +21,18 @@ def loss(qkv: Array) -> Array:
 def main() -> None:
     qkv = jax.random.normal(jax.random.key(0), (4, 2, 16, 3, 2, 16))
     truth = jax.grad(loss)(qkv)
-    clips = NamedSharding(Mesh(np.array(jax.devices()), ("data",)), PartitionSpec("data"))
+    mesh = Mesh(np.array(jax.devices()), ("data",), axis_types=(AxisType.Auto,))
+    clips = NamedSharding(mesh, PartitionSpec("data"))
     sharded = jax.jit(jax.grad(loss)).lower(jax.device_put(qkv, clips)).compile()
     gradient = sharded(jax.device_put(qkv, clips))
     by_pmap = jax.pmap(jax.grad(loss))(qkv.reshape(2, 2, *qkv.shape[1:])).reshape(qkv.shape)
+    with jax.set_mesh(mesh):
+        on_set_mesh = jax.jit(jax.grad(loss)).lower(jax.device_put(qkv, clips)).compile()
     figures = {
-        "gathers": str(sharded.as_text()).count("all-gather"),
+        "gathers": sum(str(program.as_text()).count("all-gather") for program in (sharded, on_set_mesh)),
         "sharded": gradient.sharding.is_equivalent_to(clips, gradient.ndim),
         "mesh": float(jnp.max(jnp.abs(gradient - truth))),
+        "set mesh": float(jnp.max(jnp.abs(on_set_mesh(jax.device_put(qkv, clips)) - truth))),
         "pmap": float(jnp.max(jnp.abs(by_pmap - truth))),
     }
     print(json.dumps(figures))

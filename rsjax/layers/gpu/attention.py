@@ -10,7 +10,7 @@ Axes: B clips, T frames, S cells of a frame, h heads, e head width; N tiles, R t
 
 import math
 from functools import partial
-from typing import Any, Literal, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,11 +19,11 @@ from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton
 from jaxtyping import Array, Float
 
+from rsjax.layers.packed_attention import ATTENTION, HEAD_WIDTHS, Over, Tile, flops, product, scale, sees
 from rsjax.layers.partition import each_own_clips
 
-Over = Literal["cells", "frames"]
+__all__ = ["ATTENTION", "Over", "attend", "fits", "flops"]
 
-ATTENTION = "attention"  # the name of the output and the log-sums in rematerialisation policies
 ROWS = 64  # tokens of a tile over frames
 QUERIES = 128  # of a program of the forward pass
 KEYS = 64  # of one step of the forward pass
@@ -32,18 +32,6 @@ MOST_ROWS = 256  # of a tile: the backward pass keeps gradients of all its keys 
 WARPS = 4
 WARPS_BACKWARD = 8
 STAGES = 2
-HEAD_WIDTHS = (16, 32, 64, 128)
-
-
-class Tile(NamedTuple):
-    """The tokens that one program sees: neighbouring cells of all frames it covers."""
-
-    frames: int
-    cells: int
-
-    @property
-    def rows(self) -> int:
-        return self.frames * self.cells
 
 
 def fits(shape: tuple[int, ...], over: Over) -> bool:
@@ -75,7 +63,8 @@ def attend(qkv: Float[Array, "B T S 3 h e"], over: Over, interpret: bool = False
 
 
 def _forward(qkv: Array, over: Over, interpret: bool) -> tuple[Array, tuple[Array, Array, Array]]:
-    out, log_sum = (checkpoint_name(x, ATTENTION) for x in _run_forward(over, interpret, qkv))
+    with jax.named_scope(f"attend_{over}_forward"):  # a compiler that divides the kernel among devices forgets its name
+        out, log_sum = (checkpoint_name(x, ATTENTION) for x in _run_forward(over, interpret, qkv))
     return out, (qkv, out, log_sum)
 
 
@@ -83,7 +72,8 @@ def _backward(
     over: Over, interpret: bool, saved: tuple[Array, Array, Array], cotangent: Array
 ) -> tuple[Float[Array, "B T S 3 h e"]]:
     qkv, out, log_sum = saved
-    return (_run_backward(over, interpret, qkv, out, cotangent.astype(qkv.dtype), log_sum),)
+    with jax.named_scope(f"attend_{over}_backward"):
+        return (_run_backward(over, interpret, qkv, out, cotangent.astype(qkv.dtype), log_sum),)
 
 
 @partial(each_own_clips, settings=2)
@@ -143,17 +133,6 @@ def _run_backward(
 attend.defvjp(_forward, _backward)
 
 
-def flops(shape: tuple[int, ...], over: Over) -> tuple[int, int]:
-    """Returns the operations of the products of one call, forward and backward, two a multiply-add.
-
-    Of attention over frames only pairs of a query and a key that it sees count, though a tile multiplies all its pairs.
-    The backward pass has four products; that the kernel recomputes scores, half of the forward count, is left out.
-    """
-    B, T, S, _, heads, width = shape
-    pairs = B * T * S * S if over == "cells" else B * S * T * (T + 1) // 2
-    return 4 * pairs * heads * width, 8 * pairs * heads * width
-
-
 def _tile(shape: tuple[int, ...], over: Over) -> Tile:
     _, frames, cells, _, _, _ = shape
     if over == "cells":
@@ -191,21 +170,21 @@ def _log_sums(shape: tuple[int, ...]) -> pl.BlockSpec:
 def _forward_kernel(qkv: Any, out: Any, log_sum: Any, *, tile: Tile, queries: int, keys: int) -> None:
     first = pl.program_id(0) * queries
     q = _rows(qkv, tile, first, queries, 0)
-    scale = math.log2(math.e) / math.sqrt(q.shape[-1])  # powers of two are faster than those of e
+    width = q.shape[-1]
 
     def step(i: Any, carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         total, top, weighted = carry
         k = _rows(qkv, tile, i * keys, keys, 1)
         v = _rows(qkv, tile, i * keys, keys, 2)
-        scores = _product(q, k, 1, 1) * scale
+        scores = product(q, k, 1, 1) * scale(width)
         if tile.frames > 1:
-            seen = _sees(tile, first + jnp.arange(queries)[:, None], i * keys + jnp.arange(keys)[None])
+            seen = sees(tile, first + jnp.arange(queries)[:, None], i * keys + jnp.arange(keys)[None])
             scores = jnp.where(seen, scores, jnp.finfo(jnp.float32).min)
         new_top = jnp.maximum(top, jnp.max(scores, axis=1))
         weights = jnp.exp2(scores - new_top[:, None])
         shrink = jnp.exp2(top - new_top)
         total = total * shrink + jnp.sum(weights, axis=1)
-        weighted = weighted * shrink[:, None] + _product(weights.astype(v.dtype), v, 1, 0)
+        weighted = weighted * shrink[:, None] + product(weights.astype(v.dtype), v, 1, 0)
         return total, new_top, weighted
 
     start = (
@@ -223,7 +202,7 @@ def _backward_kernel(
 ) -> None:
     k = _rows(qkv, tile, 0, tile.rows, 1)
     v = _rows(qkv, tile, 0, tile.rows, 2)
-    root = math.sqrt(k.shape[-1])
+    width = k.shape[-1]
 
     def step(i: Any, carry: tuple[Array, Array]) -> tuple[Array, Array]:
         to_k, to_v = carry
@@ -232,19 +211,19 @@ def _backward_kernel(
         g = _rows(cotangent, tile, first, queries)
         along = jnp.sum(g.astype(jnp.float32) * _rows(out, tile, first, queries).astype(jnp.float32), axis=1)
         # Transposed, (k, q): so two products of three take weights and their gradients as they are in registers.
-        weights = jnp.exp2(_product(k, q, 1, 1) * (math.log2(math.e) / root) - log_sum[pl.ds(first, queries)][None])
+        weights = jnp.exp2(product(k, q, 1, 1) * scale(width) - log_sum[pl.ds(first, queries)][None])
         if tile.frames > 1:
-            seen = _sees(tile, first + jnp.arange(queries)[None], jnp.arange(tile.rows)[:, None])
+            seen = sees(tile, first + jnp.arange(queries)[None], jnp.arange(tile.rows)[:, None])
             weights = jnp.where(seen, weights, 0.0)
-        of_scores = (weights * (_product(v, g, 1, 1) - along[None])).astype(q.dtype)
-        to_v = to_v + _product(weights.astype(g.dtype), g, 1, 0)
-        to_k = to_k + _product(of_scores, q, 1, 0)
-        _put(gradient, tile, first, _product(of_scores, k, 0, 0) / root, 0)
+        of_scores = (weights * (product(v, g, 1, 1) - along[None])).astype(q.dtype)
+        to_v = to_v + product(weights.astype(g.dtype), g, 1, 0)
+        to_k = to_k + product(of_scores, q, 1, 0)
+        _put(gradient, tile, first, product(of_scores, k, 0, 0) / math.sqrt(width), 0)
         return to_k, to_v
 
     zeros = jnp.zeros(k.shape, jnp.float32)
     to_k, to_v = jax.lax.fori_loop(0, tile.rows // queries, step, (zeros, zeros))
-    _put(gradient, tile, 0, to_k / root, 1)
+    _put(gradient, tile, 0, to_k / math.sqrt(width), 1)
     _put(gradient, tile, 0, to_v, 2)
 
 
@@ -264,15 +243,3 @@ def _cells(tile: Tile, first: Any, count: int) -> Any:
     if tile.frames == 1:
         return pl.ds(first, count)
     return slice(None)
-
-
-def _sees(tile: Tile, query: Array, key: Array) -> Array:
-    """Returns whether a query's row and a key's are of one cell and the key's is not of a later frame."""
-    return ((query ^ key) & (tile.cells - 1) == 0) & (query >= key)
-
-
-def _product(a: Array, b: Array, of_a: int, of_b: int) -> Float[Array, "m n"]:
-    """Returns the float32 product along an axis of each operand."""
-    precision = jax.lax.Precision.HIGHEST if a.dtype == jnp.float32 else None
-    dims = (((of_a,), (of_b,)), ((), ()))
-    return jax.lax.dot_general(a, b, dims, precision=precision, preferred_element_type=jnp.float32)

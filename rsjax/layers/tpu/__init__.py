@@ -1,0 +1,1 @@
+"""What TPUs need to be fast; :mod:`rsjax.layers.platform` decides where it is used."""
