@@ -28,23 +28,23 @@ ROWS = 64  # tokens of a tile over frames
 QUERIES = 128  # of a program of the forward pass
 KEYS = 64  # of one step of the forward pass
 QUERIES_BACKWARD = 32  # of one step of the backward pass
-MOST_ROWS = 256  # of a tile: the backward pass keeps gradients of all its keys and values in registers
 WARPS = 4
 WARPS_BACKWARD = 8
-STAGES = 2
+STAGES = 2  # steps of a loop whose operands are in flight
+LARGE_TILE = 2**14  # one whose keys and values leave no room for the next step's queries on an RTX 4090
 
 
 def fits(shape: tuple[int, ...], over: Over) -> bool:
     """Returns whether :func:`attend` takes a qkv of this shape (B, T, S, 3, h, e).
 
-    Head widths are 16, 32, 64 or 128. Over cells, S is a power of two from 16 to 256. Over frames, T is a power of two
-    up to 64, and S is divisible by the 64/T neighbouring cells of a tile.
+    Head widths are 16, 32, 64 or, over frames, 128. Over cells, S is a power of two from 16 to 256. Over frames, T is a
+    power of two up to 64, and S is divisible by the 64/T neighbouring cells of a tile.
     """
     _, frames, cells, _, _, width = shape
     if width not in HEAD_WIDTHS:
         return False
     if over == "cells":
-        return cells in (16, 32, 64, 128, 256)
+        return cells in (16, 32, 64, 128, 256) and width <= 64
     return frames in (1, 2, 4, 8, 16, 32, 64) and cells % (ROWS // frames) == 0
 
 
@@ -117,14 +117,19 @@ def _run_backward(
     clips, tiles, heads, _ = log_sum.shape
     like_qkv = _tokens(qkv.shape, tile)
     like_out = _tokens(out.shape, tile)
-    warps = WARPS_BACKWARD if tile.rows > ROWS else WARPS
+    warps = WARPS
+    if tile.rows > ROWS:
+        warps = WARPS_BACKWARD
+    stages = STAGES
+    if tile.rows * qkv.shape[-1] >= LARGE_TILE:
+        stages = 1
     return pl.pallas_call(
         partial(_backward_kernel, tile=tile, queries=_step(tile, QUERIES_BACKWARD)),
         grid=(1, heads, clips * tiles),
         in_specs=[like_qkv, like_out, like_out, _log_sums(log_sum.shape)],
         out_specs=like_qkv,
         out_shape=jax.ShapeDtypeStruct(qkv.shape, qkv.dtype),
-        compiler_params=triton.CompilerParams(num_warps=warps, num_stages=STAGES),
+        compiler_params=triton.CompilerParams(num_warps=warps, num_stages=stages),
         interpret=interpret,
         name=f"attend_{over}_backward",
     )(qkv, out, cotangent, log_sum)
