@@ -1,12 +1,11 @@
-"""The interface between a model and the train step: parameters, and loss terms that :func:`combine` sums.
+"""The interface between a model and the train step: parameters, batches and loss terms.
 
 The tokenizer and every family of world models implement :class:`Trainable`.
 """
 
 from typing import Any, NamedTuple, Protocol, TypeAlias, TypeVar
 
-import jax
-import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
 Scalar: TypeAlias = Float[Array, ""]
@@ -15,7 +14,6 @@ Params: TypeAlias = dict[str, Any]  # a tree of arrays
 Extra: TypeAlias = dict[str, Any] | None  # a tree of arrays that is carried from step to step with the parameters
 
 B = TypeVar("B", contravariant=True)
-Tree = TypeVar("Tree")
 
 
 class StepContext(NamedTuple):
@@ -35,7 +33,7 @@ class StepContext(NamedTuple):
 class Trainable(Protocol[B]):
     """A model with its loss on batches of type ``B``: a frozen dataclass, so that jit takes it as a static argument.
 
-    Subclasses inherit the default that nothing is carried from step to step.
+    Subclasses inherit the defaults that a batch is a dict of arrays and that nothing is carried from step to step.
     """
 
     @property
@@ -51,6 +49,10 @@ class Trainable(Protocol[B]):
         """Returns the initial ``extra``; None if nothing is carried from step to step."""
         return None
 
+    def batch(self, arrays: dict[str, np.ndarray]) -> Any:
+        """Returns the batch for :meth:`loss_terms` from a loader's stacked arrays; by default the arrays themselves."""
+        return arrays
+
     def loss_terms(self, params: Params, batch: B, key: Key[Array, ""], context: StepContext) -> dict[str, Term]:
         """Returns (weighted sum, weight) of each term of ``loss_weights`` on this device's part of a batch."""
         ...
@@ -58,37 +60,3 @@ class Trainable(Protocol[B]):
     def next_extra(self, extra: Extra, means: dict[str, Scalar]) -> Extra:
         """Returns ``extra`` after a step, from the terms' means over all devices."""
         return extra
-
-
-def over_devices(tree: Tree, axis_name: str | None) -> Tree:
-    """Adds each array over pmap's axis; without one, XLA already sees the whole batch."""
-    return tree if axis_name is None else jax.lax.psum(tree, axis_name)
-
-
-def combine(
-    terms: dict[str, Term], weights: dict[str, float], axis_name: str | None = None
-) -> tuple[Scalar, dict[str, Scalar]]:
-    """Returns this device's share of the loss, the sum of λ·sum/weight over the terms (paper Eq. 8).
-
-    Sums and weights are added over devices separately, since the mean of per-device ratios is not the global ratio.
-
-    Args:
-        terms: by name; the names must equal those of ``weights``, so that no term is misspelt or forgotten.
-        weights: λ by name.
-        axis_name: pmap's axis over which the batch is split; None if XLA sees the whole batch.
-
-    Returns:
-        This device's share of the loss (the shares of all devices add up to the loss), and each term's share without λ.
-
-    Raises:
-        KeyError: terms and weights have different names.
-    """
-    if terms.keys() != weights.keys():
-        raise KeyError(f"loss terms {sorted(terms)} are not the configured weights {sorted(weights)}")
-    shares = {}
-    loss = jnp.float32(0)
-    for name, (value, weight) in terms.items():
-        whole = over_devices(jax.lax.stop_gradient(weight), axis_name)
-        shares[name] = value / jnp.maximum(whole, 1e-8)
-        loss += weights[name] * shares[name]
-    return loss, shares

@@ -1,7 +1,6 @@
 """Resolves curricula: which records of which stores a training loop reads, in which stages."""
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -9,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from rsjax.config import ComponentConfig, CurriculumStageConfig, LoopConfig, TrainConfig
-from rsjax.data.loader import Loader
-from rsjax.data.order import Arrays, CurriculumStage, MixtureComponent, Readable, Transform, place_of
+from rsjax.data.loader import Arrays, CurriculumStage, Loader, MixtureComponent, Readable, Transform, place_of
 from rsjax.data.quarantine import NAME, Quarantine
 from rsjax.data.store import Store, StoreError, open_store
 
@@ -54,13 +52,13 @@ class LoaderFactory:
         return lines
 
 
-def plan(loop: LoopConfig, own: Store, transform: Callable[[Store], Transform], directory: Path) -> LoaderFactory:
-    """Resolves a loop's stages into records and steps.
+def loader_factory(loop: LoopConfig, own: Store, transform: Transform, directory: Path) -> LoaderFactory:
+    """Resolves the stages of a loop's curriculum into records and steps, and returns what makes its loaders.
 
     Args:
         loop: the loop; without ``stages`` it reads all of ``own`` for ``loop.steps`` steps.
         own: the store that components read unless they name another.
-        transform: returns the transform of a store's records; all must give arrays of the same shapes.
+        transform: of all stores' records.
         directory: where the list of damaged records is.
 
     Returns:
@@ -88,7 +86,7 @@ def check_stages(train: TrainConfig, own: Store) -> list[Store]:
         These stores, ``own`` first.
 
     Raises:
-        StoreError: as from :func:`plan`.
+        StoreError: as from :func:`loader_factory`.
     """
     others = []
     for part in (part for stage in train.curriculum for part in stage.components):
@@ -129,17 +127,15 @@ def choose(part: ComponentConfig, store: Store) -> np.ndarray | None:
     return chosen[: part.clips or None]
 
 
-def _resolve(
-    stage: CurriculumStageConfig, batch_size: int, own: Store, transform: Callable[[Store], Transform]
-) -> CurriculumStage:
+def _resolve(stage: CurriculumStageConfig, batch_size: int, own: Store, transform: Transform) -> CurriculumStage:
     components = []
     for config in stage.components:
         store = open_store(config.store) if config.store else own
-        component = MixtureComponent(store.source(SPLIT), transform(store), choose(config, store), config.weight)
+        component = MixtureComponent(store.source(SPLIT), transform, choose(config, store), config.weight)
         if not len(component):
             raise StoreError(f"{store.path}: its {SPLIT} split has no records; make it again")
         if config.store:
-            _check_mixable(store, component, own, MixtureComponent(own.source(SPLIT), transform(own)))
+            _check_mixable(store, component, own, MixtureComponent(own.source(SPLIT), transform))
         components.append(component)
     drawn = stage.epochs * sum(map(len, components))
     # Epochs such as 0.1 are not exact in binary, so a value just above a whole number of batches counts as that number.

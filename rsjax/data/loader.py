@@ -1,5 +1,10 @@
 """Reads batches of records with Grain, in an endless seeded order that resumes exactly, and puts them on the device.
 
+The order has stages (of a curriculum), each a mixture of shuffled components. A transform turns one record into arrays
+that stack: ``transform(record, rng) -> dict of arrays``. Its generator depends only on the loader's seed and the
+record's place in the order, so random draws resume too. With worker processes a transform has to be picklable: a
+function of a module, or a ``functools.partial`` of one.
+
 A batch has the transform's arrays, stacked, and three more of shape (batch,): ``part`` int32 and ``record`` int64, by
 which :meth:`Loader.identify` finds its clips, and ``index`` int32, the place in the batch over all processes of a
 multi-host run.
@@ -13,6 +18,8 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
@@ -20,16 +27,111 @@ import absl.flags
 import grain
 import numpy as np
 from grain.experimental import ThreadPrefetchDatasetIterator
+from jaxtyping import Int
 
 from rsjax.config import ConfigError
-from rsjax.data.order import Arrays, CurriculumStage, MixtureComponent, Transform, ordered, place_of
+from rsjax.data.codec import Record
 from rsjax.data.quarantine import MAX_DAMAGED, Quarantine
-from rsjax.data.store import RecordSource, StoreError
+from rsjax.data.store import RecordSource, Source, StoreError
+
+Arrays = dict[str, np.ndarray]
+Transform = Callable[[Record, np.random.Generator], Arrays]
 
 MAX_RESTARTS = 3  # in a row, after worker processes that die before they give a batch
 PLACE = "global_next_index"  # the key in the state of Grain's ElasticIterator
 
 _log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class MixtureComponent:
+    """Records of one source that a stage draws from.
+
+    Attributes:
+        source: the source.
+        transform: record → arrays, see above.
+        chosen: numbers of the component's records, in order; None: all records of the source.
+        weight: share of the stage's records, relative to the weights of its other components.
+    """
+
+    source: RecordSource
+    transform: Transform
+    chosen: Int[np.ndarray, " N"] | None = None
+    weight: float = 1.0
+
+    def __len__(self) -> int:
+        return len(self.source) if self.chosen is None else len(self.chosen)
+
+
+@dataclass(frozen=True)
+class CurriculumStage:
+    """A mixture of components, and its number of records; the last stage is endless, so that its number is ignored."""
+
+    components: tuple[MixtureComponent, ...]
+    records: int
+
+
+class Readable:
+    """Gives (number, record) for each record of a component; a damaged record is replaced by the next readable one.
+
+    Raises:
+        StoreError: on reading, if the quarantine has too many records or no record can be read.
+    """
+
+    def __init__(self, component: MixtureComponent, quarantine: Quarantine) -> None:
+        self._component = component
+        self._quarantine = quarantine
+
+    def __len__(self) -> int:
+        return len(self._component)
+
+    def __getitem__(self, index: int) -> tuple[int, Record]:
+        source = self._component.source
+        chosen = self._component.chosen
+        for place in range(index, index + len(self)):
+            number = place % len(self) if chosen is None else int(chosen[place % len(self)])
+            try:
+                return number, source[number]
+            except StoreError as error:
+                self._quarantine.note(place_of(source, number), error)
+                last = error
+        raise last
+
+
+def place_of(source: RecordSource, record: int) -> dict[str, Any]:
+    """Returns where a record is, JSON-ready; only its number if the source is not a store's."""
+    return source.locate(record) if isinstance(source, Source) else {"record": int(record)}
+
+
+def ordered(stages: Sequence[CurriculumStage], seed: int, quarantine: Quarantine) -> grain.MapDataset:
+    """Returns the records of all stages, one after another; each component is shuffled anew in each of its epochs.
+
+    The arrays are the transform's, ``record`` (the record's number in its source) and ``part`` (the component's number,
+    counted over all stages).
+    """
+    mixed = []
+    number = 0
+    for place, stage in enumerate(stages):
+        datasets = []
+        for component in stage.components:
+            # The first component keeps the seed itself, so that alone it has the order of a loader without stages.
+            own_seed = int(np.random.SeedSequence((seed, number)).generate_state(1)[0]) if number else seed
+            records = grain.MapDataset.source(Readable(component, quarantine)).seed(own_seed).shuffle().repeat(None)
+            datasets.append(records.random_map(partial(_transform, component.transform, number)))
+            number += 1
+        # Grain rounds weights to hundredths of the smallest one.
+        weights = [component.weight for component in stage.components]
+        dataset = grain.MapDataset.mix(datasets, weights) if len(datasets) > 1 else datasets[0]
+        mixed.append(dataset if place == len(stages) - 1 else dataset[: stage.records])
+    before = sum(stage.records for stage in stages[:-1])
+    if before:
+        mixed[-1] = mixed[-1][: len(mixed[-1]) - before - 1]  # endless data cannot be appended; this is long enough
+    return grain.MapDataset.concatenate(mixed) if before else mixed[0]
+
+
+def _transform(transform: Transform, part: int, numbered: tuple[int, Record], rng: np.random.Generator) -> Arrays:
+    number, record = numbered
+    return transform(record, rng) | {"part": np.array(part, np.int32), "record": np.array(number)}
 
 
 class Loader:
@@ -42,7 +144,7 @@ class Loader:
         stages: stages of the curriculum, one after another; the last stage is endless.
         batch_size: records per batch, over all processes of a multi-host run.
         seed: seed of the order and of the transforms' generators.
-        quarantine: the list of damaged records, which are replaced as in :class:`rsjax.data.order.Readable`.
+        quarantine: the list of damaged records, which are replaced as in :class:`Readable`.
         workers: processes that read and transform; 0: threads of this process.
         state: :meth:`state` of an earlier loader.
         shard: the share of each batch that this process gets; None: by its index among jax's processes.
@@ -178,7 +280,7 @@ def batches(
     """Returns a loader of one source, without stages, which shuffles anew in every epoch.
 
     Args:
-        transform: record → arrays, see :mod:`rsjax.data.order`.
+        transform: record → arrays, see the head of this module.
         quarantine: the file that lists damaged records; None: no file is written.
         max_damaged: share of the records that may be damaged.
         options: ``workers``, ``state`` and ``shard`` of :class:`Loader`.
@@ -220,22 +322,25 @@ class DeviceBatch(NamedTuple):
 class Prefetch:
     """An iterator over a loader's batches, which a thread of Grain makes in advance and puts onto the device.
 
-    If the loader or ``put`` fails, the call for that batch raises the error, and so does each later call. Close the
-    iterator, or use it as a context manager; this closes the loader too.
+    If the loader, ``to_batch`` or ``put`` fails, the call for that batch raises the error, and so does each later call.
+    Close the iterator, or use it as a context manager; this closes the loader too.
 
     Args:
         loader: source of the batches; nothing else may read it from now on.
-        put: turns a loader's arrays into the input of the training step, on the device.
+        to_batch: turns a loader's arrays into the input of the training step.
+        put: puts that input on the device.
         ahead: how many finished batches wait on the device, at most.
 
     Attributes:
         waited: total seconds that calls for the next batch have taken.
     """
 
-    def __init__(self, loader: Loader, put: Callable[[Arrays], Any], ahead: int = 2) -> None:
+    def __init__(
+        self, loader: Loader, to_batch: Callable[[Arrays], Any], put: Callable[[Any], Any], ahead: int = 2
+    ) -> None:
         self._loader = loader
         self._state = loader.state()
-        self._batches: Any = ThreadPrefetchDatasetIterator(_Batches(loader, put), ahead)
+        self._batches: Any = ThreadPrefetchDatasetIterator(_Batches(loader, to_batch, put), ahead)
         self._batches.start_prefetch()
         self.waited = 0.0
 
@@ -290,8 +395,9 @@ class _Batches:
     error, such as :class:`rsjax.errors.Preempted`, ends it silently, and the training loop would wait for ever.
     """
 
-    def __init__(self, loader: Loader, put: Callable[[Arrays], Any]) -> None:
+    def __init__(self, loader: Loader, to_batch: Callable[[Arrays], Any], put: Callable[[Any], Any]) -> None:
         self._loader = loader
+        self._to_batch = to_batch
         self._put = put
         self._failure: BaseException | None = None
 
@@ -305,7 +411,7 @@ class _Batches:
             before = self._loader.state()
             arrays = next(self._loader)
             clips = {name: arrays[name] for name in ("part", "record")}
-            return DeviceBatch(self._put(arrays), clips, before, self._loader.state())
+            return DeviceBatch(self._put(self._to_batch(arrays)), clips, before, self._loader.state())
         except BaseException as error:
             self._failure = error
             return error

@@ -17,8 +17,8 @@ from rsjax.clip import Video
 from rsjax.config import Config, ConfigError, ModelConfig
 from rsjax.config.model import BASELINES
 from rsjax.data.codec import Record
+from rsjax.data.loader import Arrays, Transform
 from rsjax.data.normalization import Normalization
-from rsjax.data.order import Arrays, Transform
 from rsjax.data.store import Store
 from rsjax.errors import UserError
 from rsjax.models.branch_states import Branching

@@ -22,8 +22,8 @@ import numpy as np
 from jaxtyping import Bool
 
 from rsjax.clip import Video
+from rsjax.data.loader import Arrays, Transform
 from rsjax.data.normalization import Normalization
-from rsjax.data.order import Arrays, Transform
 from rsjax.errors import UserError
 from rsjax.trainable import Params, Trainable
 

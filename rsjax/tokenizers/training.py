@@ -16,8 +16,8 @@ from rsjax.config import Config, ConfigError, ModelConfig, TokenizerConfig, Toke
 from rsjax.config.fields import differences
 from rsjax.data.codec import Record
 from rsjax.data.depth_color import depth_to_color
+from rsjax.data.loader import Arrays, Transform
 from rsjax.data.normalization import Normalization
-from rsjax.data.order import Arrays, Transform
 from rsjax.errors import UserError
 from rsjax.files import read_json
 from rsjax.tokenizers import lfq

@@ -13,8 +13,9 @@ from rich.tree import Tree
 from rsjax.config import Config
 from rsjax.models.base import create_autoencoder, create_model
 from rsjax.tools.bench import inputs
-from rsjax.trainable import Params, StepContext, combine
+from rsjax.trainable import Params, StepContext
 from rsjax.training.state import make_optimizer
+from rsjax.training.step import combine
 
 Shapes = dict[str, Any]  # nested, with ShapeDtypeStructs at the leaves
 

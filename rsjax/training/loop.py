@@ -6,13 +6,12 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import jax
 
 from rsjax.config import LoopConfig
 from rsjax.data.loader import DeviceBatch, Loader, Prefetch
-from rsjax.data.order import Arrays
 from rsjax.errors import Preempted, UserError
 from rsjax.progress import Progress, note
 from rsjax.trainable import Params, Trainable
@@ -25,8 +24,6 @@ from rsjax.training.sharding import Sharding
 from rsjax.training.state import TrainState
 from rsjax.training.step import Metrics, as_numbers, train_step
 from rsjax.training.validation import Validate
-
-B = TypeVar("B")
 
 
 class DivergedError(UserError):
@@ -42,13 +39,12 @@ class DispatchedStep(NamedTuple):
 
 
 def fit(
-    model: Trainable[B],
+    model: Trainable[Any],
     loop: LoopConfig,
     loader: Callable[[dict[str, Any] | None], Loader],
     directory: Path,
     *,
     name: str,
-    to_batch: Callable[[Arrays], B],
     start: Callable[[Params], Params] | None = None,
     resume: bool = True,
     stop_at: int | None = None,
@@ -64,7 +60,6 @@ def fit(
         loader: takes a loader's saved state (or None) and returns the loader that continues from it.
         directory: of checkpoints and logs; made if it does not exist.
         name: of the training, for the progress line.
-        to_batch: converts a loader's arrays to the model's batch.
         start: makes the initial parameters from fresh ones; not called on resuming from a checkpoint.
         resume: False deletes earlier checkpoints.
         stop_at: stop (and save) after this step, as if interrupted.
@@ -96,9 +91,9 @@ def fit(
         first = int(state.step)
         last = min(stop_at or loop.steps, loop.steps)
         skips = int(state.skipped)
-        step_fn = sharding.compile(train_step, model, loop)
+        compiled_step = sharding.compile(train_step, model, loop)
 
-        batches = stack.enter_context(Prefetch(loader(data), lambda arrays: sharding.put_batch(to_batch(arrays))))
+        batches = stack.enter_context(Prefetch(loader(data), model.batch, sharding.put_batch))
         log = progress = skipped_steps = None
         if is_lead():
             skipped_steps = SkippedSteps(directory, first)
@@ -112,7 +107,7 @@ def fit(
             profile.at(step, state)
             batch = next(batches)
             with jax.profiler.StepTraceAnnotation("train", step_num=step):
-                state, metrics = step_fn(state, batch.batch)
+                state, metrics = compiled_step(state, batch.batch)
             if pending is not None:  # only one step is computed while the next is prepared
                 skips = _count_skips(pending, skips, loop, directory, batches, skipped_steps)
             pending = DispatchedStep(step, batch, metrics)

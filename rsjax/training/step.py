@@ -8,11 +8,12 @@ import optax
 from jaxtyping import Array, Key
 
 from rsjax.config import LoopConfig
-from rsjax.trainable import Params, Scalar, StepContext, Trainable, combine, over_devices
+from rsjax.trainable import Params, Scalar, StepContext, Term, Trainable
 from rsjax.training.state import TrainState, learning_rate, make_optimizer
 
 Metrics: TypeAlias = dict[str, Scalar]
 B = TypeVar("B")
+Tree = TypeVar("Tree")
 
 
 def train_step(
@@ -37,7 +38,10 @@ def train_step(
     # Keys depend only on the step, so a resumed run draws the same numbers as an uninterrupted one.
     key = jax.random.fold_in(jax.random.key(loop.seed + 1), state.step)
     context = StepContext(state.step, state.extra, axis_name)
-    grads, metrics = gradient_share(model, state.params, batch, key, context, loop.accumulate)
+    if loop.accumulate == 1:
+        grads, metrics = jax.grad(loss_share, has_aux=True)(state.params, model, batch, key, context)
+    else:
+        grads, metrics = accumulated_gradient(state.params, model, batch, key, context, loop.accumulate)
     grads = over_devices(grads, axis_name)
     metrics = over_devices(metrics, axis_name)
     grad_norm = optax.global_norm(grads)
@@ -66,15 +70,6 @@ def train_step(
     return TrainState(state.step + 1, params, opt_state, ema, extra, skipped), metrics
 
 
-def as_numbers(metrics: Metrics) -> dict[str, float]:
-    """Returns a step's metrics as numbers, after waiting for the step."""
-    return {name: float(value) for name, value in jax.device_get(metrics).items()}
-
-
-def _is_schedule(path: tuple[object, ...], value: object) -> bool:
-    return getattr(path[-1], "tuple_name", "") == "ScaleByScheduleState"
-
-
 def loss_share(
     params: Params,
     model: Trainable[B],
@@ -95,18 +90,50 @@ def loss_share(
     return loss, {"loss": loss, **shares}
 
 
-def gradient_share(
-    model: Trainable[B], params: Params, batch: B, key: Key[Array, ""], context: StepContext, parts: int
+def combine(
+    terms: dict[str, Term], weights: dict[str, float], axis_name: str | None = None
+) -> tuple[Scalar, dict[str, Scalar]]:
+    """Returns this device's share of the loss, the sum of λ·sum/weight over the terms (paper Eq. 8).
+
+    Sums and weights are added over devices separately, since the mean of per-device ratios is not the global ratio.
+
+    Args:
+        terms: by name; the names must equal those of ``weights``, so that no term is misspelt or forgotten.
+        weights: λ by name.
+        axis_name: pmap's axis over which the batch is split; None if XLA sees the whole batch.
+
+    Returns:
+        This device's share of the loss (the shares of all devices add up to the loss), and each term's share without λ.
+
+    Raises:
+        KeyError: terms and weights have different names.
+    """
+    if terms.keys() != weights.keys():
+        raise KeyError(f"loss terms {sorted(terms)} are not the configured weights {sorted(weights)}")
+    shares = {}
+    loss = jnp.float32(0)
+    for name, (value, weight) in terms.items():
+        whole = over_devices(jax.lax.stop_gradient(weight), axis_name)
+        shares[name] = value / jnp.maximum(whole, 1e-8)
+        loss += weights[name] * shares[name]
+    return loss, shares
+
+
+def over_devices(tree: Tree, axis_name: str | None) -> Tree:
+    """Adds each array over pmap's axis; without one, XLA already sees the whole batch."""
+    return tree if axis_name is None else jax.lax.psum(tree, axis_name)
+
+
+def accumulated_gradient(
+    params: Params, model: Trainable[B], batch: B, key: Key[Array, ""], context: StepContext, parts: int
 ) -> tuple[Params, Metrics]:
-    """Returns this device's share of the gradient, and of the loss and its terms.
+    """Returns the gradient of :func:`loss_share`, and the loss and its terms, computed for one part after another.
 
     Splitting a batch into parts changes only rounding: each part is divided by the weights of the whole batch, which
     are computed first (XLA removes the network from that computation). Exceptions are the tokenizer's batch statistics,
     which are computed for each part: its codes' entropy, the discriminator's batch norm, LeCAM's averages.
     """
     gradient = jax.grad(loss_share, has_aux=True)
-    if parts == 1:
-        return gradient(params, model, batch, key, context)
     # A part takes every parts-th row, so that rows stay on their device of a mesh.
     stacked = jax.tree.map(lambda x: x.reshape(-1, parts, *x.shape[1:]).swapaxes(0, 1), batch)
 
@@ -122,3 +149,12 @@ def gradient_share(
     shapes = jax.eval_shape(lambda: gradient(params, model, first, key, context, weights))
     zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
     return jax.lax.scan(add, zeros, stacked)[0]
+
+
+def as_numbers(metrics: Metrics) -> dict[str, float]:
+    """Returns a step's metrics as numbers, after waiting for the step."""
+    return {name: float(value) for name, value in jax.device_get(metrics).items()}
+
+
+def _is_schedule(path: tuple[object, ...], value: object) -> bool:
+    return getattr(path[-1], "tuple_name", "") == "ScaleByScheduleState"

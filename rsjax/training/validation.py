@@ -9,7 +9,8 @@ import jax
 import numpy as np
 from jaxtyping import Array, Int, UInt8
 
-from rsjax.trainable import Params, StepContext, Term, Trainable, combine
+from rsjax.trainable import Params, StepContext, Term, Trainable
+from rsjax.training.step import combine
 
 DRAWS = 4  # random masks per clip
 _SEED = 20_251  # of the masks; not a setting, so that runs can be compared

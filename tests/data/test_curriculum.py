@@ -9,9 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rsjax.config import ComponentConfig, CurriculumStageConfig, LoopConfig
-from rsjax.data.codec import Record
-from rsjax.data.curriculum import check_stages, choose, plan
-from rsjax.data.order import Arrays
+from rsjax.data.curriculum import check_stages, choose, loader_factory
 from rsjax.data.store import Store, StoreError, open_store, write_store
 from tests.curricula import PAPER, mixed, stage
 from tests.data import toy
@@ -26,10 +24,6 @@ MEANT = {"pick*": {"pick up", "pick out"}, "*": set(toy.TASKS)} | {task: {task} 
 @pytest.fixture(scope="module")
 def own(tmp_path_factory: pytest.TempPathFactory) -> Store:
     return toy.store(tmp_path_factory.mktemp("curriculum") / "own", COUNT, tokenizer="a")
-
-
-def transform(store: Store) -> Any:
-    return jitter
 
 
 def loop(*stages: CurriculumStageConfig, **fields: Any) -> LoopConfig:
@@ -59,13 +53,13 @@ def test_a_number_of_clips_takes_the_first_that_pass(own: Store) -> None:
     assert all_of_them is not None and few is not None and few.tolist() == all_of_them[:3].tolist()
     enough = choose(ComponentConfig(clips=COUNT + 5), own)
     assert enough is not None and len(enough) == COUNT
-    assert plan(loop(stage(epochs=3.0, clips=8)), own, transform, own.path).loop.steps == 8 * 3 // 4
+    assert loader_factory(loop(stage(epochs=3.0, clips=8)), own, jitter, own.path).loop.steps == 8 * 3 // 4
 
 
 def test_an_empty_filter_lists_what_there_is(own: Store) -> None:
     for check in (
         lambda: check_stages(loop(stage("hard", tasks=("pick*",))), own),
-        lambda: plan(loop(stage("hard", tasks=("pick*",))), own, transform, own.path),
+        lambda: loader_factory(loop(stage("hard", tasks=("pick*",))), own, jitter, own.path),
     ):
         with pytest.raises(StoreError) as caught:
             check()
@@ -105,7 +99,7 @@ def test_steps_are_epochs_in_whole_batches_and_restarts_the_first_steps(
     entries = [replace(parts[part], epochs=tenths / 10, restart=restart) for part, tenths, restart in stages]
     steps = [-(-sizes[part] * tenths // (10 * batch_size)) for part, tenths, _ in stages]
     firsts = np.cumsum([0, *steps]).tolist()
-    feed = plan(replace(loop(*entries), batch_size=batch_size), own, transform, own.path)
+    feed = loader_factory(replace(loop(*entries), batch_size=batch_size), own, jitter, own.path)
     planned = feed.loop
     assert planned.steps == sum(steps)
     assert planned.restarts == tuple(f for f, (_, _, restart) in zip(firsts, stages, strict=False) if restart and f)
@@ -113,7 +107,7 @@ def test_steps_are_epochs_in_whole_batches_and_restarts_the_first_steps(
 
 
 def test_the_papers_curriculum_reads_each_simple_clip_twice_and_then_each_difficult_one_three_times(own: Store) -> None:
-    feed = plan(replace(loop(*PAPER), batch_size=5), own, transform, own.path)
+    feed = loader_factory(replace(loop(*PAPER), batch_size=5), own, jitter, own.path)
     planned = feed.loop
     assert (planned.steps, planned.restarts) == (6 + 9, ())
     with feed(None) as loader:
@@ -128,10 +122,10 @@ def test_the_papers_curriculum_reads_each_simple_clip_twice_and_then_each_diffic
 
 
 def test_without_stages_the_loop_stays_and_all_is_read(own: Store) -> None:
-    feed = plan(loop(steps=7), own, transform, own.path)
+    feed = loader_factory(loop(steps=7), own, jitter, own.path)
     plain = feed.loop
     assert plain == loop(steps=7) and feed.summary() == []
-    same = plan(loop(EVERYTHING), own, transform, own.path)
+    same = loader_factory(loop(EVERYTHING), own, jitter, own.path)
     one = same.loop
     assert one.steps == 8
     with feed(None) as left, same(None) as right:
@@ -141,7 +135,7 @@ def test_without_stages_the_loop_stays_and_all_is_read(own: Store) -> None:
 @settings(max_examples=5)
 @given(st.integers(0, 20))
 def test_a_batch_is_rebuilt_and_named_from_the_state_before_it_alone(own: Store, number: int) -> None:
-    feed = plan(loop(mixed({"simple": 1.0, "difficult": 2.0}), EVERYTHING), own, transform, own.path)
+    feed = loader_factory(loop(mixed({"simple": 1.0, "difficult": 2.0}), EVERYTHING), own, jitter, own.path)
     with feed(None) as loader:
         for _ in range(number):
             next(loader)
@@ -156,7 +150,7 @@ def test_a_mixture_of_two_stores_names_each_clips_own(own: Store, tmp_path: Path
     other = toy.store(tmp_path / "other", 6, first=100, tokenizer="a")
     simple = ComponentConfig(difficulties=("simple",))
     parts = (simple, ComponentConfig(store=str(other.path), weight=3.0))
-    feed = plan(loop(CurriculumStageConfig(parts)), own, transform, tmp_path)
+    feed = loader_factory(loop(CurriculumStageConfig(parts)), own, jitter, tmp_path)
     with feed(None) as loader:
         for _ in range(5):
             arrays = next(loader)
@@ -167,43 +161,36 @@ def test_a_mixture_of_two_stores_names_each_clips_own(own: Store, tmp_path: Path
 
 def test_stores_that_do_not_go_together_are_refused(own: Store, tmp_path: Path) -> None:
     toy.store(tmp_path / "other", 3, tokenizer="b")
-    toy.store(tmp_path / "same", 3, tokenizer="a")
-
-    def longer(store: Store) -> Any:
-        return jitter if store is own else stretched
-
-    for name, make, message in (
-        ("other", transform, "its tokenizer is b, that of .* is a"),
-        ("same", longer, r"its i is int64 \(2,\), that of .* is int64 \(\)"),
-        ("nothing", transform, "nothing: not there"),
+    longer = [toy.record(0) | {"i": np.zeros(2, int)}]
+    write_store(tmp_path / "same", "numbers", {"train": longer}, {"tokenizer": "a"})
+    for name, message in (
+        ("other", "its tokenizer is b, that of .* is a"),
+        ("same", r"its i is int64 \(2,\), that of .* is int64 \(\)"),
+        ("nothing", "nothing: not there"),
     ):
         with pytest.raises(StoreError, match=message):
-            plan(loop(stage(store=f"{tmp_path}/{name}")), own, make, tmp_path)
-
-
-def stretched(record: Record, rng: np.random.Generator) -> Arrays:
-    return jitter(record, rng) | {"i": np.stack([record["i"]] * 2)}
+            loader_factory(loop(stage(store=f"{tmp_path}/{name}")), own, jitter, tmp_path)
 
 
 def test_a_store_without_labels_is_read_whole_or_not_at_all(tmp_path: Path) -> None:
     write_store(tmp_path / "old", "numbers", {"train": map(toy.record, range(3))}, {})
     old = open_store(tmp_path / "old")
-    assert plan(loop(stage(epochs=4.0)), old, transform, tmp_path).loop.steps == 3
+    assert loader_factory(loop(stage(epochs=4.0)), old, jitter, tmp_path).loop.steps == 3
     check_stages(loop(SIMPLE), old)  # its tokens may have them
     with pytest.raises(StoreError, match="names no task and difficulty"):
-        plan(loop(SIMPLE), old, transform, tmp_path)
+        loader_factory(loop(SIMPLE), old, jitter, tmp_path)
 
 
 def test_damage_is_counted_once_over_stages_and_survives_a_restart(tmp_path: Path) -> None:
     own = toy.store(tmp_path / "own", 10)
     toy.damage(own.path, 4)
-    feed = plan(loop(SIMPLE, EVERYTHING, max_damaged=0.1), own, transform, tmp_path / "stage")
+    feed = loader_factory(loop(SIMPLE, EVERYTHING, max_damaged=0.1), own, jitter, tmp_path / "stage")
     for _ in range(2):
         with feed(None) as loader:
             assert 4 not in take(loader, 6)["i"]
             assert loader.quarantined() == 1
     (line,) = (tmp_path / "stage" / "quarantine.jsonl").read_text().splitlines()
     assert json.loads(line)["record"] == 4
-    strict = plan(loop(SIMPLE, EVERYTHING, max_damaged=0.0), own, transform, tmp_path / "stage")
+    strict = loader_factory(loop(SIMPLE, EVERYTHING, max_damaged=0.0), own, jitter, tmp_path / "stage")
     with strict(None) as loader, pytest.raises(StoreError, match="1 of 10 records are damaged"):
         take(loader, 6)

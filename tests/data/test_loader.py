@@ -14,8 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rsjax.config import ConfigError
-from rsjax.data.loader import Loader, batches
-from rsjax.data.order import CurriculumStage, MixtureComponent, ordered
+from rsjax.data.loader import CurriculumStage, Loader, MixtureComponent, batches, ordered
 from rsjax.data.quarantine import Quarantine
 from rsjax.data.store import Source, StoreError
 from tests.data import toy

@@ -19,7 +19,7 @@ def loader(place: int = 0, bad: tuple[int, ...] = ()) -> Loader:
 
 
 def test_batches_and_states_are_the_loaders_however_far_ahead_it_is() -> None:
-    with loader() as plain, Prefetch(loader(), lambda arrays: {"put": arrays["i"]}) as ahead:
+    with loader() as plain, Prefetch(loader(), dict, lambda arrays: {"put": arrays["i"]}) as ahead:
         for number in range(6):
             before, arrays = plain.state(), next(plain)
             time.sleep(0.02)  # for the thread to run ahead
@@ -35,7 +35,8 @@ def test_batches_and_states_are_the_loaders_however_far_ahead_it_is() -> None:
 
 def test_of_a_batch_that_processes_share_all_rows_are_named() -> None:
     shard = grain.sharding.ShardOptions(1, 2)
-    with loader() as plain, Prefetch(batches(Numbers(50), jitter, 4, seed=1, shard=shard), lambda arrays: None) as half:
+    shared = batches(Numbers(50), jitter, 4, seed=1, shard=shard)
+    with loader() as plain, Prefetch(shared, dict, lambda arrays: None) as half:
         for _ in range(3):
             arrays, fed = next(plain), next(half)
             assert fed.clips["record"].tolist() == arrays["record"][1::2].tolist()
@@ -50,7 +51,7 @@ def test_batches_are_put_before_they_are_asked_for_but_no_more_than_wait() -> No
         count.append(arrays)
         made.release()
 
-    with Prefetch(loader(), put, ahead=2) as ahead:
+    with Prefetch(loader(), dict, put, ahead=2) as ahead:
         for _ in range(3):  # two wait, and a third is ready
             assert made.acquire(timeout=120)
         assert not made.acquire(timeout=0.1)
@@ -74,7 +75,7 @@ def test_the_wait_for_a_slow_batch_is_counted(monkeypatch: pytest.MonkeyPatch) -
         seconds[0] += 5
 
     monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=monotonic))
-    with Prefetch(loader(), put) as ahead:
+    with Prefetch(loader(), dict, put) as ahead:
         for _ in range(2):
             next(ahead)
         assert ahead.waited == 10
@@ -82,7 +83,7 @@ def test_the_wait_for_a_slow_batch_is_counted(monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_an_error_arrives_where_the_batch_is_asked_for_and_stays() -> None:
-    with Prefetch(loader(bad=tuple(range(50))), lambda arrays: arrays) as ahead:
+    with Prefetch(loader(bad=tuple(range(50))), dict, lambda arrays: arrays) as ahead:
         for _ in range(2):
             with pytest.raises(StoreError, match="cannot be read"):
                 next(ahead)
@@ -94,12 +95,12 @@ def test_an_error_of_putting_arrives_whatever_its_kind(error: BaseException) -> 
     def fail(arrays: object) -> None:
         raise error
 
-    with Prefetch(loader(), fail) as ahead, pytest.raises(type(error)):
+    with Prefetch(loader(), dict, fail) as ahead, pytest.raises(type(error)):
         next(ahead)
 
 
 def test_closing_ends_the_thread_while_it_waits_for_room() -> None:
-    with Prefetch(loader(), lambda arrays: arrays, ahead=1):
+    with Prefetch(loader(), dict, lambda arrays: arrays, ahead=1):
         time.sleep(0.1)
         assert any("thread-prefetch" in thread.name for thread in threading.enumerate())
     assert not any("thread-prefetch" in thread.name for thread in threading.enumerate())

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rsjax.data.order import MixtureComponent, Readable
+from rsjax.data.loader import MixtureComponent, Readable
 from rsjax.data.quarantine import Quarantine, read_quarantine
 from rsjax.data.store import StoreError
 from tests.data.toy import Numbers, jitter

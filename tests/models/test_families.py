@@ -23,12 +23,13 @@ from rsjax.tools.pipeline.run import Run
 from rsjax.tools.pipeline.run_clips import on_store
 from rsjax.tools.pipeline.videos import Request, write_videos
 from rsjax.tools.studies.ablation.grid import expand, parse_axes
-from rsjax.trainable import StepContext, combine
+from rsjax.trainable import StepContext
 from rsjax.training import loop as loop_module
 from rsjax.training.checkpoint import load_weights
 from rsjax.training.log import SkippedSteps, read_log
 from rsjax.training.sharding import cut_elements, table
 from rsjax.training.state import create_state
+from rsjax.training.step import combine
 from tests.models import families
 from tests.tools.pipeline import toy
 

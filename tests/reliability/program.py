@@ -12,11 +12,10 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from experiments.cli import main_errors
 from rsjax.config import AdamW, LoopConfig
-from rsjax.data.loader import batches
+from rsjax.data.loader import Arrays, batches
 from rsjax.data.quarantine import NAME as QUARANTINE
 from rsjax.data.store import open_store, write_store
 from rsjax.files import write_atomically
@@ -41,6 +40,10 @@ class Heavy(toy.Regression):
 
     def init(self, key: Any) -> Any:
         return super().init(key) | {"ballast": jax.random.normal(key, (200_000,))}
+
+    def batch(self, arrays: Arrays) -> Arrays:
+        time.sleep(0.02)
+        return {"x": arrays["x"], "y": arrays["y"]}
 
     def loss_terms(self, params: Any, batch: Any, key: Any, context: StepContext) -> dict[str, Term]:
         poisoned = jnp.isin(context.step, jnp.array(self.poisoned or (-1,)))
@@ -85,15 +88,9 @@ def main() -> None:
         loader=lambda data: batches(
             source, toy.jitter, loop.batch_size, seed=3, state=data, quarantine=options.folder / QUARANTINE
         ),
-        to_batch=slowly,
     )
     save_weights(options.folder / "weights", state.weights)
     mark(options.folder, True)
-
-
-def slowly(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    time.sleep(0.02)
-    return {"x": arrays["x"], "y": arrays["y"]}
 
 
 def mark(folder: Path, finished: bool) -> None:

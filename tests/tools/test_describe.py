@@ -16,11 +16,12 @@ from rsjax.config import Config, presets
 from rsjax.config.config_fields import with_values
 from rsjax.models.base import create_model
 from rsjax.models.roboscape.architecture import Architecture
-from rsjax.models.roboscape.records import Batch
+from rsjax.models.roboscape.objective import Batch
 from rsjax.models.roboscape.transformer import empty_cache
 from rsjax.tools.describe import activation_bytes, count, describe, render
-from rsjax.trainable import StepContext, combine
+from rsjax.trainable import StepContext
 from rsjax.training.state import create_state
+from rsjax.training.step import combine
 
 DEBUG = presets.get("debug")
 NETWORK = Architecture.create(DEBUG)

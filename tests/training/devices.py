@@ -41,13 +41,13 @@ from rsjax.config import (
     TokenizerTrainConfig,
 )
 from rsjax.models.roboscape.model import RoboScape
-from rsjax.models.roboscape.records import Batch
+from rsjax.models.roboscape.objective import Batch
 from rsjax.tokenizers.training import TokenizerTraining
-from rsjax.trainable import StepContext, Term, Trainable, combine
+from rsjax.trainable import StepContext, Term, Trainable
 from rsjax.training.checkpoint import Checkpoints
 from rsjax.training.sharding import Sharding
 from rsjax.training.state import TrainState, create_state
-from rsjax.training.step import train_step
+from rsjax.training.step import combine, train_step
 
 LOOP = LoopConfig(batch_size=8, steps=3, ema=0.9, optimizer=AdamW(learning_rate=1e-2, warmup_steps=1))
 # Wide enough that the world model's matrices are cut rather than left whole.

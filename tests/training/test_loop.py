@@ -74,7 +74,7 @@ def test_a_killed_run_goes_on_from_its_last_checkpoint(
         return arrays
 
     with pytest.raises(KeyboardInterrupt):
-        train(LOOP, tmp_path, to_batch=dies_at_step_7)
+        train(LOOP, tmp_path, model=Regression(to_batch=dies_at_step_7))
     assert [row["step"] for row in read_log(tmp_path)] == [1, 2, 3, 4, 5, 6]  # two more than were saved
     assert_same(train(LOOP, tmp_path), whole[0])
     assert read_curve(tmp_path) == whole[1]
@@ -104,7 +104,7 @@ def poisoned(*steps: int) -> Callable[[dict[str, Any]], dict[str, Any]]:
 @pytest.mark.parametrize("every", [1, 100])
 def test_steps_that_are_not_finite_are_left_out_and_written_down(tmp_path: Path, every: int) -> None:
     loop = replace(LOOP, log_every=every, skip_budget=2)
-    state = train(loop, tmp_path, to_batch=poisoned(3, 7))
+    state = train(loop, tmp_path, model=Regression(to_batch=poisoned(3, 7)))
     assert int(state.step) == 9 and int(state.skipped) == 2
     assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves(state))
     rows = read_skipped(tmp_path)
@@ -118,7 +118,7 @@ def test_steps_that_are_not_finite_are_left_out_and_written_down(tmp_path: Path,
 def test_one_step_too_many_that_is_not_finite_stops_the_run(tmp_path: Path) -> None:
     loop = replace(LOOP, skip_budget=1, log_every=100, checkpoint_every=2)
     with pytest.raises(DivergedError, match=rf"{tmp_path}: 2 steps were not finite, more than 1 .*step 5"):
-        train(loop, tmp_path, to_batch=poisoned(2, 5))
+        train(loop, tmp_path, model=Regression(to_batch=poisoned(2, 5)))
     assert [row["step"] for row in read_skipped(tmp_path)] == [2, 5]
     assert int(train(loop, tmp_path).step) == 9  # from step 4 on, where nothing is poisoned now
     assert [row["step"] for row in read_skipped(tmp_path)] == [2]
@@ -215,9 +215,9 @@ def test_batches_follow_from_the_loaders_state(tmp_path: Path) -> None:
         seen.append(arrays["x"])
         return arrays
 
-    train(LOOP, tmp_path, to_batch=watch, stop_at=4)
+    train(LOOP, tmp_path, model=Regression(to_batch=watch), stop_at=4)
     first = len(seen)  # some were made ahead
-    train(LOOP, tmp_path, to_batch=watch)
+    train(LOOP, tmp_path, model=Regression(to_batch=watch))
     with loader(None, records()) as batches:
         expected = [next(batches)["x"] for _ in range(9)]
     np.testing.assert_array_equal(seen[:4], expected[:4])

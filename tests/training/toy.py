@@ -1,5 +1,6 @@
 """A linear regression with noise drawn from the step's key: what a training loop has to get right, in no time."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ import numpy as np
 from jaxtyping import Array
 
 from rsjax.config import LoopConfig
-from rsjax.data.loader import Loader, batches
+from rsjax.data.loader import Arrays, Loader, batches
 from rsjax.trainable import StepContext, Term, Trainable
 from rsjax.training.loop import fit
 from rsjax.training.state import TrainState
@@ -20,9 +21,15 @@ QUICK = {"xla_backend_optimization_level": 0}  # options of the compiler, for pr
 
 @dataclass(frozen=True)
 class Regression(Trainable[Any]):
-    """Predicts y from x, both noisy."""
+    """Predicts y from x, both noisy.
+
+    Attributes:
+        inputs: how many numbers of x it reads.
+        to_batch: changes the loader's arrays.
+    """
 
     inputs: int = 3
+    to_batch: Callable[[Arrays], Arrays] = dict
 
     @property
     def loss_weights(self) -> dict[str, float]:
@@ -30,6 +37,9 @@ class Regression(Trainable[Any]):
 
     def init(self, key: Array) -> Any:
         return {"w": jax.random.normal(key, (self.inputs,)), "b": jnp.zeros(())}
+
+    def batch(self, arrays: Arrays) -> Arrays:
+        return self.to_batch(arrays)
 
     def loss_terms(self, params: Any, batch: Any, key: Array, context: StepContext) -> dict[str, Term]:
         noise = 0.1 * jax.random.normal(key)
@@ -53,10 +63,5 @@ def loader(state: dict[str, Any] | None, source: list[dict[str, np.ndarray]] | N
 
 def train(loop: LoopConfig, directory: Path, **options: Any) -> TrainState:
     """:func:`rsjax.training.loop.fit` of the regression; ``options`` replace its arguments."""
-    usual: dict[str, Any] = {
-        "model": Regression(),
-        "loader": loader,
-        "name": "toy",
-        "to_batch": lambda arrays: arrays,
-    }
+    usual: dict[str, Any] = {"model": Regression(), "loader": loader, "name": "toy"}
     return fit(loop=loop, directory=directory, **(usual | options))

@@ -18,8 +18,8 @@ from rsjax.clip import Video
 from rsjax.config import ClipShape, Config
 from rsjax.config.config_fields import with_values
 from rsjax.data.codec import Record
+from rsjax.data.loader import Arrays, Transform
 from rsjax.data.normalization import Normalization
-from rsjax.data.order import Arrays, Transform
 from rsjax.data.store import Store
 from rsjax.models.base import Assets, WorldModel, implements
 from rsjax.models.cogvideox import pretrained

@@ -20,8 +20,8 @@ from jaxtyping import Array, Bool, Float, Key, UInt8
 
 from rsjax.clip import Video
 from rsjax.config import Config, TokenizerTrainConfig
+from rsjax.data.loader import Arrays, Transform
 from rsjax.data.normalization import Normalization
-from rsjax.data.order import Arrays, Transform
 from rsjax.devices import divide
 from rsjax.models.diffusion import latents as distributions
 from rsjax.models.irasim import pretrained

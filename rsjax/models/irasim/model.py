@@ -16,8 +16,8 @@ from jaxtyping import Array, Float, Int, Key
 from rsjax.clip import Video
 from rsjax.config import ClipShape, Config
 from rsjax.data.codec import Record
+from rsjax.data.loader import Arrays, Transform
 from rsjax.data.normalization import Normalization
-from rsjax.data.order import Arrays, Transform
 from rsjax.data.store import Store
 from rsjax.models.base import Assets, WorldModel, implements
 from rsjax.models.diffusion.schedule import add_noise, target

@@ -21,8 +21,8 @@ from jaxtyping import Array, Bool, Key
 from rsjax.clip import Video
 from rsjax.config import Config, TokenizerTrainConfig, require
 from rsjax.data.codec import Record
+from rsjax.data.loader import Arrays, Transform
 from rsjax.data.normalization import Normalization
-from rsjax.data.order import Arrays, Transform
 from rsjax.devices import divide
 from rsjax.errors import UserError
 from rsjax.models.ivideogpt.config import ConditionalVQConfig, IVideoGPTConfig

@@ -16,8 +16,8 @@ from jaxtyping import Array, Float, Int, Key
 from rsjax.clip import Video
 from rsjax.config import ClipShape, Config, RoboScapeConfig, TokenizerConfig, TokenModelConfig
 from rsjax.data.codec import Record
+from rsjax.data.loader import Arrays, Transform
 from rsjax.data.normalization import Normalization
-from rsjax.data.order import Arrays, Transform
 from rsjax.data.store import Store
 from rsjax.devices import divide
 from rsjax.models.base import Assets, TeacherForced, WorldModel, implements
@@ -29,7 +29,7 @@ from rsjax.models.roboscape.departures.self_conditioning import conditions_itsel
 from rsjax.models.roboscape.departures.whole_frames import hidden
 from rsjax.models.roboscape.flops import forward_flops
 from rsjax.models.roboscape.imagine import TokenImagination
-from rsjax.models.roboscape.records import Batch
+from rsjax.models.roboscape.objective import Batch
 from rsjax.models.roboscape.sample import Tokens, encode_prompt, rollout, rollout_from
 from rsjax.models.roboscape.teacher_forcing import score_tokens
 from rsjax.models.roboscape.transformer import Transformer, empty_cache

@@ -1,26 +1,63 @@
 """RoboScape's training objective (paper Eq. 4 to 8), term by term.
 
-Each term is a sum over cells or keypoints and the number of them; :func:`rsjax.trainable.combine` divides and adds the
-terms up by their weights λ (Eq. 8). Where Eq. 4 and 7 sum over frames, the sums here run over the masked cells, the
+Each term is a sum over cells or keypoints and the number of them; :func:`rsjax.training.step.combine` divides, and adds
+the terms up by their weights λ (Eq. 8). Where Eq. 4 and 7 sum over frames, the sums here run over the masked cells, the
 only ones that the network has to predict.
 
 A new term is a line in :func:`loss_terms` and a field ``NAME_weight`` in :class:`rsjax.config.LossConfig`.
 
-Axes: B clips, T frames, H×W = S cells, n vocabularies of V codes, D code bits, K keypoints.
+Axes: B clips, T frames, H×W = S cells, n vocabularies of V codes, D code bits, A numbers of an action, N tracks of a
+clip, K of them keypoints.
 """
 
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int, Int32
 
+from rsjax import clip
 from rsjax.config import RoboScapeConfig, TokenModelConfig
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.departures.masked_keypoints import compared
 from rsjax.models.roboscape.departures.observed_anchor import anchor
 from rsjax.models.roboscape.departures.visible_keypoints import counted_frames
-from rsjax.models.roboscape.keypoints import attention_map, select
-from rsjax.models.roboscape.records import Batch
 from rsjax.tokenizers import lfq
 from rsjax.trainable import Term
+
+
+@struct.dataclass
+class Batch:
+    """Tokenized clips for a training step.
+
+    Attributes:
+        rgb: token of each cell, little-endian, 0 … 2^D - 1.
+        depth: token of each cell of the colourised depth map, likewise.
+        actions: inputs of the action encoder (:meth:`rsjax.data.normalization.Normalization.action_inputs`); row t led
+            into frame t.
+        tracks: as in :class:`rsjax.clip.Clip`.
+        visible: as in :class:`rsjax.clip.Clip`.
+        weight: 1 for a clip that counts, 0 for padding.
+        index: the clip's place in the global batch, which decides its random masks whichever device it is on.
+        has_depth: 1 for a clip with depth, 0 for one without, whose depth tokens are zeros and never read; None: all
+            clips have depth.
+    """
+
+    rgb: Int32[clip.Array, "B T H W"]
+    depth: Int32[clip.Array, "B T H W"]
+    actions: Float[clip.Array, "B T A"]
+    tracks: Float[clip.Array, "B N T 2"]
+    visible: Bool[clip.Array, "B N T"]
+    weight: Float[clip.Array, " B"]
+    index: Int32[clip.Array, " B"]
+    has_depth: Float[clip.Array, " B"] | None = None
+
+
+@struct.dataclass
+class Keypoints:
+    """Selected tracks on the token grid."""
+
+    cells: Int[Array, "B K T"]  # row·W + column of the nearest cell
+    visible: Bool[Array, "B K T"]  # the frames in which the point counts
 
 
 def loss_terms(
@@ -91,3 +128,36 @@ def keypoint_distance(
     later = jnp.take_along_axis(s_hat[:, 1:], cells[:, 1:, :, None], axis=2)
     anchors = jnp.take_along_axis(first, cells[:, :1, :, None], axis=2)
     return jnp.sum(jnp.square(later - anchors), axis=-1)
+
+
+def motion_magnitude(tracks: Float[Array, "*B N T 2"], visible: Bool[Array, "*B N T"]) -> Float[Array, "*B N"]:
+    """Returns M_i = Σ_t ‖p_i^{t+1} - p_i^t‖₂ over the steps where the point counts before and after."""
+    # The norm's gradient at 0 is undefined, which is harmless: no gradient flows through tracks.
+    steps = jnp.linalg.norm(tracks[..., 1:, :] - tracks[..., :-1, :], axis=-1)
+    return jnp.sum(steps * (visible[..., 1:] & visible[..., :-1]), axis=-1)
+
+
+def token_cells(tracks: Float[Array, "*B 2"], grid: int) -> Int[Array, "*B"]:
+    """Returns the index (row·grid + column) of the nearest cell; points outside the image go to its edge."""
+    column, row = (jnp.clip(jnp.floor(tracks[..., i] * grid), 0, grid - 1).astype(jnp.int32) for i in (0, 1))
+    return row * grid + column
+
+
+def select(tracks: Float[Array, "B N T 2"], visible: Bool[Array, "B N T"], count: int, grid: int) -> Keypoints:
+    """Returns T_sample, the ``count`` tracks that move most, on the token grid.
+
+    Args:
+        visible: the frames in which each point counts.
+    """
+    _, chosen = jax.lax.top_k(motion_magnitude(tracks, visible), count)
+    take = jax.vmap(lambda values, indices: values[indices])
+    return Keypoints(token_cells(take(tracks, chosen), grid), take(visible, chosen))
+
+
+def attention_map(keypoints: Keypoints, grid: int, gamma: float) -> Float[Array, "B T H W"]:
+    """Returns the map of Eq. 6: γ in the cells that a selected track passes through while visible, 1 elsewhere."""
+    b, _, t = keypoints.cells.shape
+    cells = jnp.where(keypoints.visible, keypoints.cells, grid**2)  # hidden points go to a spare cell
+    hit = jnp.zeros((b, t, grid**2 + 1), bool)
+    hit = hit.at[jnp.arange(b)[:, None, None], jnp.arange(t)[None, None], cells].set(True)
+    return jnp.where(hit[..., :-1], gamma, 1.0).reshape(b, t, grid, grid)

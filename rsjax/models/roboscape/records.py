@@ -1,43 +1,13 @@
 """Converts token records to arrays and arrays to batches, in the loader. Plain numpy."""
 
 import numpy as np
-from flax import struct
-from jaxtyping import Bool, Float, Int32
 
-from rsjax.clip import Array
 from rsjax.config import ClipShape
 from rsjax.data.codec import Record
+from rsjax.data.loader import Arrays
 from rsjax.data.normalization import Normalization
-from rsjax.data.order import Arrays
 from rsjax.models.roboscape.departures.shifts import drawn_copy
-
-
-@struct.dataclass
-class Batch:
-    """Tokenized clips for a training step.
-
-    Attributes:
-        rgb: token of each cell, little-endian, 0 … 2^D - 1.
-        depth: token of each cell of the colourised depth map, likewise.
-        actions: inputs of the action encoder (:meth:`rsjax.data.normalization.Normalization.action_inputs`); row t led
-            into frame t.
-        tracks: as in :class:`rsjax.clip.Clip`.
-        visible: as in :class:`rsjax.clip.Clip`.
-        weight: 1 for a clip that counts, 0 for padding.
-        index: the clip's place in the global batch, which decides its random masks whichever device it is on.
-        has_depth: 1 for a clip with depth, 0 for one without, whose depth tokens are zeros and never read; None: all
-            clips have depth.
-    """
-
-    rgb: Int32[Array, "B T H W"]
-    depth: Int32[Array, "B T H W"]
-    actions: Float[Array, "B T A"]
-    tracks: Float[Array, "B N0 T 2"]
-    visible: Bool[Array, "B N0 T"]
-    weight: Float[Array, " B"]
-    index: Int32[Array, " B"]
-    has_depth: Float[Array, " B"] | None = None
-
+from rsjax.models.roboscape.objective import Batch
 
 ARRAYS = ("rgb", "depth", "actions", "tracks", "visible", "has_depth")
 

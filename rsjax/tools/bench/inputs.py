@@ -15,8 +15,8 @@ from jaxtyping import Array, Float, Int
 
 from rsjax.clip import Video
 from rsjax.config import Config
+from rsjax.data.loader import Arrays
 from rsjax.data.normalization import Normalization
-from rsjax.data.order import Arrays
 from rsjax.models.base import Assets, WorldModel, create_autoencoder, with_random_files
 from rsjax.models.roboscape.architecture import Architecture
 

@@ -18,7 +18,7 @@ import numpy as np
 from rsjax.config import Config
 from rsjax.config.config_fields import with_values
 from rsjax.data import loader
-from rsjax.data.curriculum import plan
+from rsjax.data.curriculum import loader_factory
 from rsjax.data.loader import Prefetch
 from rsjax.data.store import open_store, write_store
 from rsjax.devices import on_cpu
@@ -225,12 +225,12 @@ def feed(config: Config, budget: float) -> Numbers:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "store"
         write_store(path, "tokens", {"train": (model.example(rng) for _ in range(FEED_CLIPS))}, {})
-        make = plan(loop, open_store(path), lambda store: transform, Path(folder))
+        make = loader_factory(loop, open_store(path), transform, Path(folder))
         loop = make.loop
         sharding = Sharding.create(loop)
         step = sharding.compile(train_step, model, loop)
         state = jax.jit(lambda: create_state(model, loop))()
-        with Prefetch(make(None), lambda arrays: sharding.put_batch(model.batch(arrays))) as batches:
+        with Prefetch(make(None), model.batch, sharding.put_batch) as batches:
             steps = 0
             began = 0.0
             waited = 0.0

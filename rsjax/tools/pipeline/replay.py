@@ -17,10 +17,11 @@ from rsjax.errors import UserError
 from rsjax.models.base import create_autoencoder, create_model
 from rsjax.tools.pipeline.run import Run
 from rsjax.tools.pipeline.stages import pretrained_start, tokenizer_loader, world_model_loader
-from rsjax.trainable import Params, StepContext, Trainable, combine
+from rsjax.trainable import Params, StepContext, Trainable
 from rsjax.training.checkpoint import Checkpoints
 from rsjax.training.log import SKIPPED, read_skipped
 from rsjax.training.sharding import Sharding
+from rsjax.training.step import combine
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from rsjax.config import Config
-from rsjax.data.curriculum import LoaderFactory, check_stages, plan
+from rsjax.data.curriculum import LoaderFactory, check_stages, loader_factory
 from rsjax.data.normalization import Normalization
-from rsjax.data.order import Transform
 from rsjax.data.quarantine import NAME as QUARANTINE
 from rsjax.data.store import Store
 from rsjax.evaluation.results import save_evaluation
@@ -159,7 +158,6 @@ def train_tokenizer(run: Run, resume: bool) -> None:
         loader,
         run.directory / "tokenizer",
         name="tokenizer",
-        to_batch=model.batch,
         start=pretrained_start(model, train.start_from, "tokenizer"),
         resume=resume,
         validate=TokenizerValidation(run),
@@ -203,7 +201,6 @@ def train_world_model(run: Run, resume: bool) -> None:
         loader,
         run.directory / "world_model",
         name="world model",
-        to_batch=model.batch,
         start=pretrained_start(model, train.start_from, "world_model"),
         resume=resume,
         validate=WorldModelValidation(run),
@@ -220,33 +217,30 @@ def evaluate(run: Run) -> None:
 
 
 def tokenizer_loader(run: Run) -> LoaderFactory:
-    """Returns what makes the loaders of the tokenizer's training, on the run's clips.
+    """Returns a factory of loaders of the tokenizer's training: the run's clips, as the curriculum orders them.
 
     Raises:
         StoreError: the clips are missing, or the curriculum of ``tokenizer_train`` does not fit them.
     """
     transform = create_autoencoder(run.config).transform()
-    loop = run.config.loop("tokenizer")
-    return plan(loop, run.open_clips(), lambda store: transform, run.directory / "tokenizer")
+    return loader_factory(run.config.loop("tokenizer"), run.open_clips(), transform, run.directory / "tokenizer")
 
 
 def world_model_loader(run: Run) -> LoaderFactory:
-    """Returns what makes the loaders of the world model's training, on the prepared store.
+    """Returns a factory of loaders of the world model's training: prepared records, as the curriculum orders them.
 
     Raises:
         StoreError: the prepared store is missing, or the curriculum of ``train`` does not fit it.
     """
     prepared = run.open_prepared()
-    transform = create_model(run.config).transform(Normalization.create(prepared))
-
-    def transform_of(store: Store) -> Transform:
-        ours = _depth_range(prepared)
+    loop = run.config.loop("world_model")
+    ours = _depth_range(prepared)
+    for store in check_stages(loop, prepared):
         theirs = _depth_range(store)
         if theirs and theirs != ours and is_lead():
             note(f"{store.path}: its depth covers {theirs}, this run's {ours}; the model does not see the difference")
-        return transform
-
-    return plan(run.config.loop("world_model"), prepared, transform_of, run.directory / "world_model")
+    transform = create_model(run.config).transform(Normalization.create(prepared))
+    return loader_factory(loop, prepared, transform, run.directory / "world_model")
 
 
 def _depth_range(store: Store) -> str:

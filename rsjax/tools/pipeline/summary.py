@@ -7,7 +7,7 @@ import numpy as np
 from rsjax.config import Config, to_dict
 from rsjax.evaluation.results import Evaluation, load_evaluation
 from rsjax.files import write_json
-from rsjax.models.roboscape.keypoints import motion_magnitude
+from rsjax.models.roboscape.objective import motion_magnitude
 from rsjax.tools.pipeline.provenance import read_starts
 from rsjax.tools.pipeline.run import STAGES, TRAINED, Run
 from rsjax.tools.studies.report.figures import ClipFigure

@@ -15,8 +15,8 @@ from jaxtyping import UInt8
 from rsjax.clip import Video
 from rsjax.data.clips import Clips, load_clips, readable, spread
 from rsjax.data.depth_color import depth_to_color
+from rsjax.data.loader import Arrays
 from rsjax.data.normalization import Normalization
-from rsjax.data.order import Arrays
 from rsjax.data.store import RecordSource, Store
 from rsjax.evaluation.metrics.psnr import psnr
 from rsjax.evaluation.registry import Scene, Unavailable, metrics

@@ -6,7 +6,7 @@ Axes: K keypoints.
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from rsjax.models.roboscape.keypoints import motion_magnitude
+from rsjax.models.roboscape.objective import motion_magnitude
 from rsjax.tools.ingest.annotators.tracks import LucasKanade, grid_points
 from rsjax.tools.play.session import Session, Start
 from rsjax.tools.play.tree import Node

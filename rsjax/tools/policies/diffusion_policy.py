@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Float32, Key, UInt8
 
 from rsjax.config import ConfigError
 from rsjax.data.codec import Record
-from rsjax.data.order import Arrays
+from rsjax.data.loader import Arrays
 from rsjax.tools.policies.config import PolicyConfig
 from rsjax.tools.policies.ddpm import add_noise, cosine_schedule, sample
 from rsjax.tools.policies.unet1d import PolicyNet
@@ -63,6 +63,10 @@ class DiffusionPolicy(Trainable[Any]):
         controls = jnp.zeros((1, self.config.horizon, self.width))
         frames = jnp.zeros((1, self.config.observations, self.cropped, self.cropped, 3))
         return self.net.init(key, controls, jnp.zeros(1, jnp.int32), frames)["params"]
+
+    def batch(self, arrays: Arrays) -> Arrays:
+        """Returns the arrays that :meth:`loss_terms` reads."""
+        return {name: arrays[name] for name in ("frames", "controls", "index")}
 
     def loss_terms(
         self, params: Params, batch: dict[str, Array], key: Key[Array, ""], context: StepContext

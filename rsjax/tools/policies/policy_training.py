@@ -89,7 +89,7 @@ def _fit(
         (lambda fresh: jax.tree.map(np.array, start.params)) if start else None
     )  # a copy, because training steps donate their parameters
     per_step = ("samples", loop.batch_size)
-    options: dict[str, Any] = {"name": name, "to_batch": _batch, "start": begin, "stop_at": stop, "per_step": per_step}
+    options: dict[str, Any] = {"name": name, "start": begin, "stop_at": stop, "per_step": per_step}
     state = fit(model, loop, loader, directory, **options)
     if stop < loop.steps and state.step > stop:  # an earlier call with other stops trained past this one
         raise _other_stops(directory, stop)
@@ -101,7 +101,3 @@ def _other_stops(directory: Path, stop: int) -> UserError:
         f"{directory}: this training is beyond step {stop}, where it did not keep the policy: it kept it at other "
         f"steps; choose another --out, or ask for those"
     )
-
-
-def _batch(arrays: dict[str, Any]) -> dict[str, Any]:
-    return {name: arrays[name] for name in ("frames", "controls", "index")}

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from rsjax.models.roboscape import keypoints as kp
+from rsjax.models.roboscape.objective import attention_map, motion_magnitude, select, token_cells
 
 GRID = 4
 POSITION = st.floats(-0.25, 1.25, width=32)
@@ -37,13 +37,13 @@ def plain_cell(point: np.ndarray) -> int:
 def test_motion_magnitude_sums_the_visible_steps() -> None:
     tracks, visible = random_tracks(0)
     expected = [[plain_magnitude(*x) for x in zip(*clip, strict=True)] for clip in zip(tracks, visible, strict=True)]
-    np.testing.assert_allclose(kp.motion_magnitude(tracks, visible), np.array(expected), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(motion_magnitude(tracks, visible), np.array(expected), rtol=1e-5, atol=1e-6)
 
 
 @settings(deadline=None)
 @given(hnp.arrays(np.float32, 2, elements=POSITION))
 def test_no_other_cell_is_nearer(point: np.ndarray) -> None:
-    index = int(kp.token_cells(jnp.array(point), GRID))
+    index = int(token_cells(jnp.array(point), GRID))
     row, column = divmod(index, GRID)
     best_row, best_column = divmod(plain_cell(point), GRID)
     here, best = (
@@ -54,14 +54,14 @@ def test_no_other_cell_is_nearer(point: np.ndarray) -> None:
 
 
 def test_x_counts_columns_and_y_rows() -> None:
-    assert int(kp.token_cells(jnp.array([0.9, 0.1]), GRID)) == 3
-    assert int(kp.token_cells(jnp.array([0.1, 0.9]), GRID)) == 12
+    assert int(token_cells(jnp.array([0.9, 0.1]), GRID)) == 3
+    assert int(token_cells(jnp.array([0.1, 0.9]), GRID)) == 12
 
 
 @pytest.mark.parametrize("count", [1, 4, 9])
 def test_the_tracks_that_move_most_are_selected(count: int) -> None:
     tracks, visible = random_tracks(1)
-    selected = kp.select(tracks, visible, count, GRID)
+    selected = select(tracks, visible, count, GRID)
     for clip in range(len(tracks)):
         magnitudes = [plain_magnitude(*x) for x in zip(tracks[clip], visible[clip], strict=True)]
         expected = {
@@ -77,7 +77,7 @@ def test_the_tracks_that_move_most_are_selected(count: int) -> None:
 
 def test_the_attention_map_is_gamma_along_the_visible_tracks() -> None:
     tracks, visible = random_tracks(2)
-    selected = kp.select(tracks, visible, 3, GRID)
+    selected = select(tracks, visible, 3, GRID)
     expected = np.ones((3, 5, GRID, GRID))
     for clip in range(3):
         for i in range(3):
@@ -85,10 +85,10 @@ def test_the_attention_map_is_gamma_along_the_visible_tracks() -> None:
                 if selected.visible[clip, i, t]:
                     row, column = divmod(int(selected.cells[clip, i, t]), GRID)
                     expected[clip, t, row, column] = 7.0
-    np.testing.assert_array_equal(kp.attention_map(selected, GRID, 7.0), expected)
+    np.testing.assert_array_equal(attention_map(selected, GRID, 7.0), expected)
     assert set(np.unique(expected)) == {1.0, 7.0}
 
 
 def test_where_nothing_is_visible_the_map_is_flat() -> None:
     tracks, visible = random_tracks(3)
-    np.testing.assert_array_equal(kp.attention_map(kp.select(tracks, visible & False, 3, GRID), GRID, 5.0), 1.0)
+    np.testing.assert_array_equal(attention_map(select(tracks, visible & False, 3, GRID), GRID, 5.0), 1.0)

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from rsjax.config import CorruptionConfig, Departures, LossConfig, RoboScapeConfig
-from rsjax.models.roboscape import keypoints as kp
 from rsjax.models.roboscape import masking
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.departures.action_dropout import dropped_actions
 from rsjax.models.roboscape.departures.visible_keypoints import counted_frames
 from rsjax.models.roboscape.model import RoboScape
-from rsjax.models.roboscape.records import Batch
+from rsjax.models.roboscape.objective import Batch, attention_map, select
 from rsjax.models.roboscape.transformer import Transformer
-from rsjax.trainable import StepContext, Term, combine
+from rsjax.trainable import StepContext, Term
+from rsjax.training.step import combine
 from tests.models.roboscape.toy import depart, roboscape
 
 MODEL = Architecture(frames=4, grid=2, code_bits=4, action_inputs=3, width=8, blocks=1, heads=2)
@@ -78,8 +78,8 @@ def test_each_branch_is_scored_on_its_own_clean_tokens_where_masked(has_depth: t
     inputs = (given.tokens, given.mask, batch.actions)
     logits, _ = jax.jit(Transformer(MODEL).apply)({"params": params}, *inputs, no_depth=has == 0)
     counted = counted_frames(Departures(), batch.visible)
-    points = kp.select(batch.tracks, counted, LOSS.num_keypoints, MODEL.grid)
-    emphasis = np.asarray(kp.attention_map(points, MODEL.grid, LOSS.gamma))
+    points = select(batch.tracks, counted, LOSS.num_keypoints, MODEL.grid)
+    emphasis = np.asarray(attention_map(points, MODEL.grid, LOSS.gamma))
 
     expected = dict.fromkeys(("rgb", "depth", "attention"), 0.0)
     cells = dict.fromkeys(expected, 0)

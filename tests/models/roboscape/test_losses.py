@@ -10,11 +10,10 @@ import pytest
 
 from rsjax.config import Departures, LossConfig, RoboScapeConfig, presets
 from rsjax.models.roboscape.architecture import Architecture
-from rsjax.models.roboscape.keypoints import Keypoints, attention_map
-from rsjax.models.roboscape.objective import loss_terms
-from rsjax.models.roboscape.records import Batch
+from rsjax.models.roboscape.objective import Batch, Keypoints, attention_map, loss_terms
 from rsjax.tokenizers import lfq
-from rsjax.trainable import Term, combine
+from rsjax.trainable import Term
+from rsjax.training.step import combine
 
 B, T, GRID, BITS, VOCABULARIES = 3, 4, 3, 6, 2
 ARCHITECTURE = Architecture(frames=T, grid=GRID, code_bits=BITS, vocabularies=VOCABULARIES, action_inputs=1)

@@ -8,7 +8,8 @@ import pytest
 from rsjax.data.normalization import Normalization
 from rsjax.data.store import Record, encode_clip
 from rsjax.models.roboscape.model import RoboScape
-from rsjax.models.roboscape.records import Batch, token_arrays, token_batch
+from rsjax.models.roboscape.objective import Batch
+from rsjax.models.roboscape.records import token_arrays, token_batch
 from tests.tools.pipeline import toy
 
 NORMALIZATION = Normalization((0.1, -0.2, 0.3), (0.5, 1.0, 2.0), (0.1, 1.0))

@@ -14,7 +14,8 @@ from rsjax.models.roboscape.departures.self_conditioning import conditions_itsel
 from rsjax.models.roboscape.model import RoboScape
 from rsjax.models.roboscape.transformer import Transformer
 from rsjax.tokenizers import lfq
-from rsjax.trainable import StepContext, combine
+from rsjax.trainable import StepContext
+from rsjax.training.step import combine
 from tests.models.roboscape.test_loss_terms import KEY, LOSS, random_batch, random_params
 from tests.models.roboscape.test_loss_terms import MODEL as VISIBLE
 from tests.models.roboscape.toy import depart, roboscape

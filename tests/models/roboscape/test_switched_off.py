@@ -10,7 +10,8 @@ from rsjax.config import presets
 from rsjax.config.config_fields import with_values
 from rsjax.models.base import create_model
 from rsjax.tools.bench import inputs
-from rsjax.trainable import StepContext, combine
+from rsjax.trainable import StepContext
+from rsjax.training.step import combine
 
 DEBUG = presets.debug()
 

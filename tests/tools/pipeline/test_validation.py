@@ -14,20 +14,21 @@ from hypothesis import strategies as st
 from rsjax.config import Config, EvalConfig
 from rsjax.data.clips import readable
 from rsjax.data.depth_color import depth_to_color
+from rsjax.data.loader import Arrays, Transform
 from rsjax.data.normalization import Normalization
-from rsjax.data.order import Arrays, Transform
 from rsjax.data.store import Record, StoreError, write_store
 from rsjax.evaluation import evaluate as evaluation
 from rsjax.evaluation.metrics.psnr import psnr
 from rsjax.models.base import create_model
 from rsjax.models.roboscape.model import RoboScape
-from rsjax.models.roboscape.records import ARRAYS, Batch, token_batch
+from rsjax.models.roboscape.objective import Batch
+from rsjax.models.roboscape.records import ARRAYS, token_batch
 from rsjax.models.trained import TrainedModel
 from rsjax.tokenizers.tokenize import token_record
 from rsjax.tools.pipeline import validation as module
 from rsjax.tools.pipeline.run import Run
 from rsjax.tools.pipeline.validation import TokenizerValidation, WorldModelValidation, record_batches
-from rsjax.trainable import combine
+from rsjax.training.step import combine
 from rsjax.training.validation import DRAWS, Validation, _terms, validation_loss
 from tests.tools.pipeline import toy
 
