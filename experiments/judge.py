@@ -28,13 +28,12 @@ def main() -> None:
     """Writes RUN/judge and prints the results of the validation."""
     tune_process()
     options = parse_options(sys.argv[1:], "python -m experiments.judge", Options.__doc__ or "", Options())
-    from rich.console import Console
-
     from rsjax.tools.policies.judges.judge_training import make_judge
     from rsjax.tools.policies.judges.validation import table
+    from rsjax.tools.studies.tables import as_markdown
 
     result = make_judge(options.run, options.data_dir, options.store, part(options, JudgeSettings))
-    Console().print(table(result))
+    print(f"judge on {result['clips']} held-out clips: frames by label\n\n{as_markdown(table(result))}\n")
     print(options.run / "judge")
 
 

@@ -50,10 +50,8 @@ def main() -> None:
     """Writes result.json, results.md and videos to RUN/plan/KEY, and prints a table."""
     tune_process()
     options = parse_options(sys.argv[1:], "python -m experiments.plan", Options.__doc__ or "", Options())
-    from rich.console import Console
-
     from rsjax.models.load_run import load
-    from rsjax.tools.policies.planning.closed_loop import PlanSettings, compare, folder, table
+    from rsjax.tools.policies.planning.closed_loop import PlanSettings, compare, folder, results_text
     from rsjax.tools.policies.planning.planner import PlannerConfig
     from rsjax.tools.policies.policy import load_policy
     from rsjax.tools.policies.worlds.simulator_world import SimulatorWorld
@@ -68,7 +66,7 @@ def main() -> None:
         policies[f"policy {options.policy}"] = load_policy(options.policy)
     with closing(SimulatorWorld.lift(trained.config.sim, 1)) as simulator:
         result = compare(trained, options.run, simulator, settings, policies)
-    Console().print(table(result))
+    print(results_text(result))
     print(folder(options.run, result["key"]) / "result.json")
 
 

@@ -12,16 +12,25 @@ from rsjax.clip import Clip
 from rsjax.config import SimConfig, to_dict
 from rsjax.config.metaworld import SIMPLE
 from rsjax.config.sim import CONTROLS
-from rsjax.tools.sim import expert as lift_expert
 from rsjax.tools.sim import lift, metaworld
+from rsjax.tools.sim.expert import SIMPLE as SIMPLE_MODES
 from rsjax.tools.sim.render import Camera, View
 from rsjax.tools.sim.scenery import SEEN, Change, Variation, draw_variation
 from rsjax.tools.sim.tracks import Snapshot, grid_pixels, object_pixels, track
 
 
+class Expert(Protocol):
+    """A scripted policy with the manner of one episode."""
+
+    @property
+    def manner(self) -> Any: ...
+    def act(self, state: Any, /) -> Float[np.ndarray, " C"]: ...
+
+
 class Simulator(Protocol):
     """The interface that an episode needs from a simulator; lengths in metres, in world coordinates."""
 
+    def draw_expert(self, rng: np.random.Generator, /) -> Expert: ...
     def reset(self, seed: int, variation: Variation = ..., /) -> None: ...
     def step(self, action: Float[np.ndarray, " C"], /) -> None: ...
     def render(self) -> View: ...
@@ -128,7 +137,8 @@ def run_episode(sim: Simulator, config: SimConfig, plan: EpisodePlan) -> Clip:
     else:
         looks = SEEN
     sim.reset(int(rng.integers(2**32)), looks)
-    act, manner = _expert(sim, rng)
+    expert = sim.draw_expert(rng)
+    act = expert.act
     if plan.replay:
         act = _replayed(plan.replay, CONTROLS[config.env], np.random.default_rng([config.seed, episode, 4]))
     views = []
@@ -149,14 +159,14 @@ def run_episode(sim: Simulator, config: SimConfig, plan: EpisodePlan) -> Clip:
             pixels = _track_pixels(config, sim, bodies, np.random.default_rng([config.seed, episode, 1]))
     tracks, visible = track(pixels, views[0].depth, bodies, shots)
     provenance = _origin(config, episode) | {
-        "expert": to_dict(manner),
+        "expert": to_dict(expert.manner),
         "objects": _in_the_image(shots[0].camera, places, sim.object_width),
         "versions": {name: importlib.metadata.version(name) for name in _packages(config)},
     }
     if plan.task:
         simple = plan.task in SIMPLE
     else:
-        simple = manner.mode in lift_expert.SIMPLE
+        simple = expert.manner.mode in SIMPLE_MODES
     if simple:
         provenance["difficulty"] = "simple"
     else:
@@ -201,15 +211,6 @@ def _origin(config: SimConfig, episode: int) -> dict[str, Any]:
         "camera": config.camera,
         "control_hz": 20 if config.env == "lift" else metaworld.CONTROL_HZ,
     }
-
-
-def _expert(sim: Any, rng: np.random.Generator) -> tuple[Callable[[Any], Float[np.ndarray, " C"]], Any]:
-    """Draws an episode's manner and returns the policy with it."""
-    if isinstance(sim, metaworld.MetaworldSim):
-        manner = metaworld.draw_manner(rng)
-        return metaworld.Expert(sim.policy, manner, rng).act, manner
-    lifts = lift_expert.draw_manner(rng)
-    return lift_expert.Expert(lifts, rng).act, lifts
 
 
 def _replayed(replay: Replay, controls: int, rng: np.random.Generator) -> Callable[[Any], Float[np.ndarray, " C"]]:

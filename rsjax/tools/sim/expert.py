@@ -9,14 +9,28 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from rsjax.tools.sim.lift import State
-
 MODES = {"lift": 0.55, "drop": 0.16, "near_miss": 0.16, "explore": 0.13}  # mode → probability
 SIMPLE = ("lift",)  # modes that a curriculum begins with; the others are difficult
 TABLE_HEIGHT = 0.8  # metres
 OPEN = -1.0
 CLOSE = 1.0
 NOISE_MEMORY = 0.8  # correlation of the action noise from one control step to the next
+
+
+@dataclass(frozen=True)
+class State:
+    """The expert's observation: positions in metres in the world, yaws in radians about the vertical.
+
+    Attributes:
+        gripper: position of the gripper.
+        goal: position to which the actions so far have sent it.
+    """
+
+    gripper: Float[np.ndarray, " 3"]
+    goal: Float[np.ndarray, " 3"]
+    gripper_yaw: float
+    cube: Float[np.ndarray, " 3"]
+    cube_yaw: float
 
 
 @dataclass(frozen=True)
@@ -85,7 +99,7 @@ class Expert:
     TURN_GAIN = 1.5  # action per radian
 
     def __init__(self, manner: Manner, rng: np.random.Generator) -> None:
-        self._manner = manner
+        self.manner = manner
         self._rng = rng
         self._phase = "hover"
         self._phase_step = 0
@@ -97,17 +111,17 @@ class Expert:
 
     def act(self, state: State) -> Float[np.ndarray, " 7"]:
         """Returns the next action."""
-        explores = self._manner.mode == "explore"
+        explores = self.manner.mode == "explore"
         target, finger = self._wander() if explores else self._pick(state)
         action = np.zeros(7)
-        action[:3] = np.clip(self.GAIN * (target - state.goal), -self._manner.speed, self._manner.speed)
+        action[:3] = np.clip(self.GAIN * (target - state.goal), -self.manner.speed, self.manner.speed)
         if not explores and self._phase in ("hover", "descend"):
             # the cube looks the same after a quarter turn
             error = (state.cube_yaw - state.gripper_yaw + np.pi / 4) % (np.pi / 2) - np.pi / 4
             action[5] = np.clip(self.TURN_GAIN * error, -0.5, 0.5)
-        if self._step < self._manner.delay:
+        if self._step < self.manner.delay:
             action[:] = 0
-        scale = np.repeat([self._manner.noise, self._manner.turn_noise], 3)
+        scale = np.repeat([self.manner.noise, self.manner.turn_noise], 3)
         fresh = np.sqrt(1 - NOISE_MEMORY**2) * scale * self._rng.standard_normal(6)
         self._noise = NOISE_MEMORY * self._noise + fresh
         action[:6] += self._noise
@@ -121,7 +135,7 @@ class Expert:
 
     def _pick(self, state: State) -> tuple[Float[np.ndarray, " 3"], float]:
         """Returns target and finger action by phase: hover, descend, grasp, carry, release."""
-        manner = self._manner
+        manner = self.manner
         grasp = state.cube + np.array(manner.offset)
         above = grasp + np.array([0, 0, manner.hover])
         error = above - state.gripper

@@ -3,13 +3,13 @@
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int32
 
 from rsjax.tools.sim.base import MujocoSim, choose_camera
+from rsjax.tools.sim.expert import Expert, State, draw_manner
 from rsjax.tools.sim.gl import choose_gl
 from rsjax.tools.sim.render import Renderer
 from rsjax.tools.sim.scenery import SEEN, Scenery, Variation
@@ -24,22 +24,6 @@ NEAR = ("near", (0.55, 0.25, 1.15), (0.01, 0.0, 0.925), 32.0)
 STEP = 0.015  # metres by which an action of 1 moves the goal: 0.3 m/s
 TURN = 0.15  # radians, likewise
 REACH = np.array([[-0.35, -0.4, 0.8], [0.3, 0.4, 1.3]])  # bounds of the goal position, metres
-
-
-@dataclass(frozen=True)
-class State:
-    """The expert's observation: positions in metres in the world, yaws in radians about the vertical.
-
-    Attributes:
-        gripper: position of the gripper.
-        goal: position to which the actions so far have sent it.
-    """
-
-    gripper: Float[np.ndarray, " 3"]
-    goal: Float[np.ndarray, " 3"]
-    gripper_yaw: float
-    cube: Float[np.ndarray, " 3"]
-    cube_yaw: float
 
 
 def _load_robosuite() -> Any:
@@ -101,6 +85,10 @@ class LiftSim(MujocoSim):
         self._cube_id = self._model.body(CUBE_BODY).id
         self._scenery = Scenery(self._model, self._camera_id, [self._cube_id], CENTRE)
         self._renderer = Renderer(self._model, self._camera_id, image_size)
+
+    def draw_expert(self, rng: np.random.Generator) -> Expert:
+        """Draws an episode's manner, and returns the expert with it."""
+        return Expert(draw_manner(rng), rng)
 
     def reset(self, seed: int, variation: Variation = SEEN) -> None:
         """Begins an episode; the seed (0 … 2³² - 1) determines the initial poses of the arm and the cube."""

@@ -85,6 +85,10 @@ class MetaworldSim(MujocoSim):
         self.state: Float[np.ndarray, " 39"] = np.zeros(39)
         self.success = False
 
+    def draw_expert(self, rng: np.random.Generator) -> "Expert":
+        """Draws an episode's manner, and returns the task's expert with it."""
+        return Expert(self.policy, draw_manner(rng), rng)
+
     def reset(self, seed: int, variation: Variation = SEEN) -> None:
         """Begins an episode; the seed (0 … 2³² - 1) determines the positions of the objects and the goal."""
         import mujoco

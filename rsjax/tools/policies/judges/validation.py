@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
-from rich.table import Table
 
 from rsjax.evaluation.statistics import wilson
 from rsjax.tools.policies.judges.judge import FAIL, LABELS, SUCCESS, UNINTERPRETABLE, Judge
 from rsjax.tools.policies.judges.trained_judge import Footage, spoilt
+from rsjax.tools.studies.tables import ABSENT, Table, as_markdown
 
 KINDS = ("raw", "reconstructed", "generated")
 BINS = 10
@@ -85,30 +85,26 @@ def summary(validation: dict[str, Any] | None) -> dict[str, Any] | None:
 
 
 def markdown(judge: dict[str, Any] | None) -> list[str]:
-    """Returns a :func:`summary` as Markdown lines: confusion matrix and calibration, for each kind of video."""
+    """Returns a :func:`summary` as parts of a Markdown text: confusion matrix and calibration by kind of video."""
     if judge is None:
         return ["", "The judge has no validation.json: how far it can be trusted is unknown."]
     found = " / ".join(LABELS)
-    lines = ["", f"The judge on held-out clips (frames called {found}, by what they are):", ""]
-    lines += [f"| video | {' | '.join(LABELS)} | right | calibration error |", "|---|---|---|---|---|---|"]
+    rows = []
     for kind, part in judge.items():
-        rows = [" / ".join(map(str, row)) if any(row) else "–" for row in part["confusion"]]
-        right = f"{100 * part['right'][0]:.1f} %"
-        error = f"{part['calibration_error']:.3f}"
-        lines.append(f"| {kind} | {' | '.join(rows)} | {right} | {error} |")
-    return lines
+        counts = [" / ".join(map(str, row)) if any(row) else ABSENT for row in part["confusion"]]
+        rows.append([kind, *counts, f"{100 * part['right'][0]:.1f} %", f"{part['calibration_error']:.3f}"])
+    table = as_markdown(Table(("video", *LABELS, "right", "calibration error"), rows))
+    return ["", f"The judge on held-out clips (frames called {found}, by what they are):", "", table]
 
 
 def table(result: dict[str, Any]) -> Table:
-    """Formats a validation as a table: a row for each kind of video and true label."""
-    out = Table(title=f"judge on {result['clips']} held-out clips: frames by label")
-    for heading in ("video", "truth", *LABELS, "right", "calibration error"):
-        out.add_column(heading, justify="left" if heading in ("video", "truth") else "right")
+    """Returns a validation as a table: a row for each kind of video and true label."""
+    rows = []
     for kind in KINDS:
         part = result.get(kind)
         for i, row in enumerate(part["confusion"] if part else ()):
             if any(row):
                 share = f"{row[i] / sum(row):.1%}"
                 error = f"{part['calibration_error']:.3f}" if i == 0 else ""  # type: ignore[index]
-                out.add_row(kind, LABELS[i], *map(str, row), share, error)
-    return out
+                rows.append([kind, LABELS[i], *map(str, row), share, error])
+    return Table(("video", "truth", *LABELS, "right", "calibration error"), rows)

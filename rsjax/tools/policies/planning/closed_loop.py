@@ -12,7 +12,6 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from jaxtyping import Float32, UInt8
-from rich.table import Table
 
 from rsjax.artifact import make_once
 from rsjax.config import content_key
@@ -43,6 +42,7 @@ from rsjax.tools.policies.worlds.model_world import model_key
 from rsjax.tools.policies.worlds.world import FIRST_SEED, Actor, Observation, World, run_episodes
 from rsjax.tools.sim.expert import skilled_expert
 from rsjax.tools.studies.report.video import write_mp4
+from rsjax.tools.studies.tables import ABSENT, Table, as_markdown
 
 EnergyName: TypeAlias = Literal["judge", "tokens", "pixels", "lpips"]
 MakeActor: TypeAlias = Callable[[int, UInt8[np.ndarray, "S S 3"]], Actor]  # from an episode's seed and goal image
@@ -233,7 +233,7 @@ def compare(
                 progress.update(len(done))
         result = _summary(done, settings, key, validation)
         write_json(place / "result.json", result)
-        write_file(place / "results.md", _markdown(result).encode())
+        write_file(place / "results.md", results_text(result).encode())
     return result
 
 
@@ -242,42 +242,19 @@ def folder(run: Path, key: str) -> Path:
     return run / "plan" / key[:8]
 
 
-def table(result: dict[str, Any]) -> Table:
-    """Formats the result of a comparison as a table."""
-    out = Table(title=_title(result))
-    for heading in HEADINGS:
-        out.add_column(heading, justify="left" if heading == HEADINGS[0] else "right")
-    for row in _cells(result):
-        out.add_row(*row)
-    return out
-
-
-def _markdown(result: dict[str, Any]) -> str:
-    rows = [list(HEADINGS), ["---"] * len(HEADINGS), *_cells(result)]
-    lines = [_title(result), "", *(f"| {' | '.join(row)} |" for row in rows)]
-    if result["settings"]["energy"] == "judge":
-        judge = markdown(result["judge"])
-    else:
-        judge = []
-    return "\n".join([*lines, *judge, ""])
-
-
-def _title(result: dict[str, Any]) -> str:
+def results_text(result: dict[str, Any]) -> str:
+    """Returns the result of a comparison in Markdown: title, table, and the judge if it was the energy."""
     settings = result["settings"]
-    return f"success in the simulator, {settings['episodes']} episodes; energy: {settings['energy']}"
-
-
-def _cells(result: dict[str, Any]) -> list[list[str]]:
+    title = f"success in the simulator, {settings['episodes']} episodes; energy: {settings['energy']}"
     rows = []
     for name, way in result["ways"].items():
-        if way["seconds_per_decision"] is None:
-            seconds = "–"
-        else:
+        seconds = ABSENT
+        if way["seconds_per_decision"] is not None:
             seconds = f"{way['seconds_per_decision']:.2f}"
         interval = f"{way['success_low']:.0%} – {way['success_high']:.0%}"
-        numbers = [f"{way['success']:.0%}", interval, f"{way['steps']:.1f}", seconds, str(way["clipped"])]
-        rows.append([name, *numbers])
-    return rows
+        rows.append([name, f"{way['success']:.0%}", interval, f"{way['steps']:.1f}", seconds, str(way["clipped"])])
+    judge = markdown(result["judge"]) if settings["energy"] == "judge" else []
+    return "\n".join([title, "", as_markdown(Table(HEADINGS, rows)), *judge, ""])
 
 
 def _goal(simulator: World, seed: int, max_steps: int) -> UInt8[np.ndarray, "S S 3"]:

@@ -26,6 +26,17 @@ from rsjax.tools.policies.studies.policy_learning import interval_text, percent
 from rsjax.tools.policies.studies.trials import Trials, try_policy
 from rsjax.tools.policies.worlds.model_world import FirstFrame
 from rsjax.tools.policies.worlds.world import World, run_episodes
+from rsjax.tools.studies.tables import Table, as_markdown
+
+HEADINGS = (
+    "round",
+    "imagined",
+    "judged a success",
+    "uninterpretable",
+    "policy",
+    "success in the simulator",
+    "95 %",
+)
 
 
 @dataclass(frozen=True)
@@ -189,26 +200,26 @@ def differences(results: dict[str, Any]) -> list[dict[str, Any]]:
 
 def table(results: dict[str, Any]) -> str:
     """Returns the results in Markdown."""
-    lines = [
-        "| round | imagined | judged a success | uninterpretable | policy | success in the simulator | 95 % |",
-        "|---|---|---|---|---|---|---|",
-    ]
     share = _share(results["before"])
-    lines.append(f"| 0 | | | | before | {percent(share)} | {interval_text(share)} |")
+    rows = [["0", "", "", "", "before", percent(share), interval_text(share)]]
     for row in results["rounds"]:
         for arm in ("imagined", "control"):
             share = _share(row[arm])
-            counts = " | | "
+            counts = ["", "", ""]
             if arm == "imagined":
-                counts = (
-                    f"{row['episodes']} | {row['kept']} | {percent(wilson(row['uninterpretable'], row['episodes']))}"
-                )
-            lines.append(f"| {row['round']} | {counts} | {arm} | {percent(share)} | {interval_text(share)} |")
-    lines += ["", "| last round | difference | 95 % | better? |", "|---|---|---|---|"]
+                unclear = wilson(row["uninterpretable"], row["episodes"])
+                counts = [str(row["episodes"]), str(row["kept"]), percent(unclear)]
+            rows.append([str(row["round"]), *counts, arm, percent(share), interval_text(share)])
+    differences = []
     for gap in results["differences"]:
         estimate = Estimate(gap["value"], gap["low"], gap["high"])
         names = " - ".join(gap["compares"])
-        lines.append(f"| {names} | {percent(estimate)} | {interval_text(estimate)} | {gap['verdict']} |")
+        differences.append([names, percent(estimate), interval_text(estimate), gap["verdict"]])
+    lines = [
+        as_markdown(Table(HEADINGS, rows)),
+        "",
+        as_markdown(Table(("last round", "difference", "95 %", "better?"), differences)),
+    ]
     return "\n".join([*lines, *markdown(results["judge"]), ""])
 
 

@@ -21,6 +21,7 @@ from rsjax.tools.policies.studies.policy_learning import interval_text, percent
 from rsjax.tools.policies.studies.trials import FPS, Result, Trials, first_frames, try_policy
 from rsjax.tools.policies.worlds.world import World
 from rsjax.tools.studies.report.video import write_mp4
+from rsjax.tools.studies.tables import ABSENT, Table, as_markdown
 
 SHARES = (0.01, 0.03, 0.06, 0.12, 0.25, 0.5, 0.75)  # of the training after which policies are saved, before its end
 
@@ -159,8 +160,15 @@ def _title(row: Mapping[str, Any]) -> str:
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
     """Returns the results in Markdown: agreement, success, and the judges that decided success."""
-    names = ("run", "Pearson r", "95 %", *NUMBERS.values(), "bias", "same outcome", "uninterpretable")
-    lines = [f"| {' | '.join(names)} |", "|---" * len(names) + "|"]
+    lines = [as_markdown(_agreement_table(rows)), "", FORMULAS, "", as_markdown(_success_table(rows))]
+    for number, row in enumerate(rows):
+        if row["judge"] not in [before["judge"] for before in rows[:number]]:
+            lines += markdown(row["judge"])
+    return "\n".join([*lines, ""])
+
+
+def _agreement_table(rows: Sequence[Mapping[str, Any]]) -> Table:
+    lines = []
     for row in rows:
         if "pearson" in row:
             value, low, high = (row["pearson"][name] for name in ("value", "low", "high"))
@@ -169,33 +177,25 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
             else:
                 bounds = f"{low:.2f} … {high:.2f}"
             numbers = [value, *(row[name] for name in NUMBERS)]
-            r, *others = ["–" if number is None else f"{number:.3f}" for number in numbers]
-            cells = [row["run"], r, "no variation" if value is None else bounds, *others, f"{row['bias']:+.3f}"]
-            cells += [f"{100 * row[name]:.0f} %" for name in ("same_outcome", "uninterpretable")]
-            lines.append(f"| {' | '.join(cells)} |")
-    lines += [
-        "",
-        FORMULAS,
-        "",
-        "| policy | in | success | 95 % | uninterpretable | numbers clipped |",
-        "|---|---|---|---|---|---|",
-    ]
+            r, *others = [ABSENT if number is None else f"{number:.3f}" for number in numbers]
+            shares = [f"{100 * row[name]:.0f} %" for name in ("same_outcome", "uninterpretable")]
+            bounds = "no variation" if value is None else bounds
+            lines.append([row["run"], r, bounds, *others, f"{row['bias']:+.3f}", *shares])
+    return Table(("run", "Pearson r", "95 %", *NUMBERS.values(), "bias", "same outcome", "uninterpretable"), lines)
+
+
+def _success_table(rows: Sequence[Mapping[str, Any]]) -> Table:
+    """Returns the success of each policy in the simulator, which is the same for all runs, and in each run's model."""
+    lines = []
     for number, row in enumerate(rows):
         for world in ("simulator", "world_model") if not number else ("world_model",):
-            if world == "simulator":
-                place = "the simulator"
-            else:
-                place = row["run"]
             for name, each in row["policies"].items():
                 share = wilson(sum(each[world]), len(each[world]))
-                spoilt = each["uninterpretable"]
+                place = "the simulator"
+                unclear = ""
                 if world == "world_model":
-                    unclear = percent(wilson(sum(spoilt), len(spoilt)))
-                else:
-                    unclear = ""
-                cells = [name, place, percent(share), interval_text(share), unclear, str(each["clipped"][world])]
-                lines.append(f"| {' | '.join(cells)} |")
-    for number, row in enumerate(rows):
-        if row["judge"] not in [before["judge"] for before in rows[:number]]:
-            lines += markdown(row["judge"])
-    return "\n".join([*lines, ""])
+                    place = row["run"]
+                    unclear = percent(wilson(sum(each["uninterpretable"]), len(each["uninterpretable"])))
+                clipped = str(each["clipped"][world])
+                lines.append([name, place, percent(share), interval_text(share), unclear, clipped])
+    return Table(("policy", "in", "success", "95 %", "uninterpretable", "numbers clipped"), lines)

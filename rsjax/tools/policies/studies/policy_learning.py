@@ -17,6 +17,7 @@ from rsjax.tools.policies.policy_training import train_policy
 from rsjax.tools.policies.studies.figures import success_curves
 from rsjax.tools.policies.studies.trials import Trials, try_policy
 from rsjax.tools.policies.worlds.world import World
+from rsjax.tools.studies.tables import Table, as_markdown
 
 SAME = 0.1  # "as good as real demonstrations" allows a success rate that is lower by this much
 
@@ -152,20 +153,19 @@ def claims(rows: Sequence[dict[str, Any]], most: int) -> list[dict[str, Any]]:
 
 def table(rows: Sequence[dict[str, Any]], found: Sequence[dict[str, Any]]) -> str:
     """Returns the results in Markdown."""
-    lines = ["| policy | demonstrations | success | 95 % | episodes |", "|---|---|---|---|---|"]
+    policies = []
     for row in rows:
         share = pooled(row)
-        count = np.size(row["success"])
-        parts = [f"{row[kind]} {kind}" for kind in ("real", "synthetic") if row[kind]]
-        lines.append(f"| {row['name']} | {' + '.join(parts)} | {percent(share)} | {interval_text(share)} | {count} |")
-    lines += ["", "| claim | difference | 95 % | |", "|---|---|---|---|"] if found else []
+        demos = " + ".join(f"{row[kind]} {kind}" for kind in ("real", "synthetic") if row[kind])
+        policies.append([row["name"], demos, percent(share), interval_text(share), str(np.size(row["success"]))])
+    lines = [as_markdown(Table(("policy", "demonstrations", "success", "95 %", "episodes"), policies))]
+    differences = []
     for claim in found:
         gap = Estimate(claim["value"], claim["low"], claim["high"])
-        if claim["margin"]:
-            margin = f" (margin {100 * claim['margin']:g})"
-        else:
-            margin = ""
-        lines.append(f"| {claim['claim']}{margin} | {percent(gap)} | {interval_text(gap)} | {claim['verdict']} |")
+        margin = f" (margin {100 * claim['margin']:g})" if claim["margin"] else ""
+        differences.append([f"{claim['claim']}{margin}", percent(gap), interval_text(gap), claim["verdict"]])
+    if differences:
+        lines += ["", as_markdown(Table(("claim", "difference", "95 %", ""), differences))]
     return "\n".join([*lines, ""])
 
 

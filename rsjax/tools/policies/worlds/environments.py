@@ -25,7 +25,7 @@ from rsjax.tools.policies.worlds.model_world import FirstFrame, ModelWorld
 from rsjax.tools.policies.worlds.simulator_world import SimulatorWorld
 from rsjax.tools.policies.worlds.starts import Starts
 from rsjax.tools.policies.worlds.world import Observation, WorldState
-from rsjax.tools.sim.lift import State
+from rsjax.tools.sim.expert import State
 
 FAR = 10.0  # metres; nothing that the simulator's cameras see is farther
 STEPS = 30  # default length of an episode: 6 s at 5 frames per second

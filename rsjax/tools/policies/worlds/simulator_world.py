@@ -18,7 +18,8 @@ from rsjax.progress import note
 from rsjax.tools.policies.worlds.actions import LIFT_UNIT, ActionRange
 from rsjax.tools.policies.worlds.world import WorldState
 from rsjax.tools.sim.episode import Simulator
-from rsjax.tools.sim.lift import LiftSim, State
+from rsjax.tools.sim.expert import State
+from rsjax.tools.sim.lift import LiftSim
 
 Control: TypeAlias = Callable[[State], Float[np.ndarray, " D"]]  # from the simulator's state, at each control step
 
