@@ -44,6 +44,12 @@ def test_the_core_imports_no_tool() -> None:
     assert not wrong
 
 
+def test_tokenizers_import_no_model() -> None:
+    known = modules()
+    tokenizers = {name: path for name, path in known.items() if name.startswith("rsjax.tokenizers")}
+    assert not [name for name, path in tokenizers.items() if any("models" in one for one in imported(path, known))]
+
+
 def test_an_installation_holds_every_module() -> None:
     """Setuptools leaves out a folder without ``__init__.py``, with all folders in it."""
     folders = {path.parent for path in (ROOT / "rsjax").rglob("*.py")}

@@ -13,7 +13,7 @@ import pytest
 from rsjax.config import Config, TokenizerConfig
 from rsjax.models.base import create_autoencoder
 from rsjax.models.irasim.config import KLConfig
-from rsjax.tokenizers.conditional_vq import Codebook, CrossAttention
+from rsjax.models.ivideogpt.conditional_vq import Codebook, CrossAttention
 from rsjax.tokenizers.flops import products, tokenizer_flops
 from rsjax.tokenizers.magvit2 import Tokenizer
 from rsjax.tokenizers.vae_blocks import SelfAttention

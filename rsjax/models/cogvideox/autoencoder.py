@@ -18,24 +18,20 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Key, UInt8
 
 from rsjax.clip import Video
-from rsjax.config import Config, TokenizerTrainConfig, require
+from rsjax.config import Config, require
 from rsjax.data.codec import Record
 from rsjax.data.loader import Arrays, Transform
 from rsjax.data.normalization import Normalization
 from rsjax.devices import divide
+from rsjax.models.cogvideox import causal_vae as vae
 from rsjax.models.cogvideox.config import COMPRESSION, CausalVAEConfig, CogVideoXConfig, padded_frames
 from rsjax.models.diffusion import latents as distributions
 from rsjax.models.saved import check_alike, read_model
-from rsjax.tokenizers import causal_vae as vae
-from rsjax.tokenizers.autoencoder import Autoencoder
 from rsjax.tokenizers.codec import images_per_pass, in_chunks
 from rsjax.tokenizers.flops import traced_flops
-from rsjax.tokenizers.lpips import lpips
 from rsjax.tokenizers.magvit2 import to_frames, to_unit
-from rsjax.tokenizers.training import lpips_weights, require_no_adversarial
-from rsjax.trainable import Extra, Params, StepContext, Term
-
-Batch = dict[str, Any]  # frames 0–255 (B, T, H, W, 3) and index (B,), which determines a clip's noise
+from rsjax.tokenizers.training import require_no_adversarial
+from rsjax.trainable import Params
 
 FREE = {"kl_weight", "image_draws", "image_noise", "compute_dtype"}
 
@@ -52,12 +48,10 @@ def init(config: CausalVAEConfig, key: Key[Array, ""]) -> Params:
 
 
 @dataclass(frozen=True)
-class CausalVAETraining(Autoencoder[Batch]):
+class CausalVAETraining(distributions.PosteriorTraining):
     """Trains the autoencoder to reconstruct consecutive frames from a sample of their posterior."""
 
     config: CausalVAEConfig
-    train: TokenizerTrainConfig
-    image_size: int
 
     def __post_init__(self) -> None:
         require_no_adversarial(self.train, "CogVideoX's autoencoder")
@@ -73,37 +67,19 @@ class CausalVAETraining(Autoencoder[Batch]):
         assert isinstance(config.model, CogVideoXConfig)
         return cls(config.model.autoencoder, config.tokenizer_train, config.clips.image_size)
 
-    @property
-    def loss_weights(self) -> dict[str, float]:
-        weights = {name: w for name, w in self.train.loss_weights.items() if name in ("l1", "l2", "perceptual")}
-        return weights | {"kl": self.config.kl_weight, "standard": 1.0}
-
     def init(self, key: Key[Array, ""]) -> Params:
         return init(self.config, key)
 
-    def init_extra(self) -> Extra:
-        if "perceptual" not in self.loss_weights:
-            return None
-        return {"lpips": lpips_weights(self.train, self.image_size)}
+    def posterior(self, params: Params, frames: Any) -> tuple[Array, Array]:
+        return distributions.posterior(vae.encode(self.config, params, frames))
 
-    def loss_terms(self, params: Params, batch: Batch, key: Key[Array, ""], context: StepContext) -> dict[str, Term]:
-        """Returns the terms of :func:`rsjax.models.diffusion.latents.means_of_terms`, and "perceptual" if it is on."""
-        frames = to_unit(batch["frames"])
-        mean, log_variance = distributions.posterior(vae.encode(self.config, params, frames))
-        latents = distributions.draw(mean, log_variance, key, batch["index"])
-        output = vae.decode(self.config, params, latents)
-        means = distributions.means_of_terms(frames, output, mean, log_variance, latents, params["latents"])
-        if "perceptual" in self.loss_weights:
-            assert context.extra is not None
-            images = (x.reshape(-1, *x.shape[2:]) for x in (frames, output))
-            means["perceptual"] = jnp.mean(lpips(context.extra["lpips"], *images))
-        count = jnp.float32(len(frames))
-        return {name: (means[name] * count, count) for name in self.loss_weights}
+    def decode(self, params: Params, latents: Any) -> Array:
+        return vae.decode(self.config, params, latents)
 
     def transform(self) -> Transform:
         return partial(_window, self.train.frames_per_clip, self.train.flip)
 
-    def batch(self, arrays: Arrays) -> Batch:
+    def batch(self, arrays: Arrays) -> distributions.Batch:
         return {name: arrays[name] for name in ("frames", "index")}
 
     def codec(self, params: Params, normalization: Normalization) -> "CausalCodec":

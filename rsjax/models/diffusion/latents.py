@@ -1,19 +1,78 @@
-"""Loss terms and standardised latents of autoencoders with a Gaussian posterior.
+"""Autoencoders with a Gaussian posterior: their training and their standardised latents.
 
 Axes: B rows of a batch, z latent channels.
 """
 
+from dataclasses import dataclass
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
-from rsjax.trainable import Params, Scalar
+from rsjax.config import TokenizerTrainConfig
+from rsjax.tokenizers.autoencoder import Autoencoder
+from rsjax.tokenizers.lpips import lpips
+from rsjax.tokenizers.magvit2 import to_unit
+from rsjax.tokenizers.training import lpips_weights
+from rsjax.trainable import Extra, Params, Scalar, StepContext, Term
 
 LOG_VARIANCE = (-30.0, 20.0)  # limits of the posterior's log-variance, as in the public code
 Pixels = Float[Array, "*N 3"]
 Latents = Float[Array, "*M z"]
+Batch = dict[
+    str, Any
+]  # "frames", images or videos of 0–255 (B, …, H, W, 3), and "index" (B,), which determines the noise
+
+
+@dataclass(frozen=True)
+class PosteriorTraining(Autoencoder[Batch]):
+    """Trains an autoencoder to reconstruct RGB frames from a sample of their posterior.
+
+    A family adds the network: :meth:`posterior`, :meth:`decode`, ``init`` and the other methods of an autoencoder. The
+    parameters contain "latents", the "mean" and "log_deviation" of each channel.
+
+    Attributes:
+        config: settings of the network, with ``kl_weight``.
+        train: settings of the training.
+        image_size: pixels per side of an image.
+    """
+
+    config: Any
+    train: TokenizerTrainConfig
+    image_size: int
+
+    def posterior(self, params: Params, frames: Pixels) -> tuple[Latents, Latents]:
+        """Returns the mean and the log-variance of the latents of frames in [-1, 1]; they are not standardised."""
+        raise NotImplementedError
+
+    def decode(self, params: Params, latents: Latents) -> Pixels:
+        """Decodes latents that are not standardised."""
+        raise NotImplementedError
+
+    @property
+    def loss_weights(self) -> dict[str, float]:
+        weights = {name: w for name, w in self.train.loss_weights.items() if name in ("l1", "l2", "perceptual")}
+        return weights | {"kl": self.config.kl_weight, "standard": 1.0}
+
+    def init_extra(self) -> Extra:
+        if "perceptual" not in self.loss_weights:
+            return None
+        return {"lpips": lpips_weights(self.train, self.image_size)}
+
+    def loss_terms(self, params: Params, batch: Batch, key: Key[Array, ""], context: StepContext) -> dict[str, Term]:
+        """Returns the terms of :func:`means_of_terms`, and "perceptual" if it is on."""
+        frames = to_unit(batch["frames"])
+        mean, log_variance = self.posterior(params, frames)
+        latents = draw(mean, log_variance, key, batch["index"])
+        output = self.decode(params, latents)
+        means = means_of_terms(frames, output, mean, log_variance, latents, params["latents"])
+        if "perceptual" in self.loss_weights:
+            assert context.extra is not None
+            images = (x.reshape(-1, *x.shape[-3:]) for x in (frames, output))
+            means["perceptual"] = jnp.mean(lpips(context.extra["lpips"], *images))
+        count = jnp.float32(len(frames))
+        return {name: (means[name] * count, count) for name in self.loss_weights}
 
 
 def posterior(made: Float[Array, "*M z2"]) -> tuple[Latents, Latents]:

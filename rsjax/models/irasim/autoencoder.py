@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Key, UInt8
 
 from rsjax.clip import Video
-from rsjax.config import Config, TokenizerTrainConfig
+from rsjax.config import Config
 from rsjax.data.loader import Arrays, Transform
 from rsjax.data.normalization import Normalization
 from rsjax.devices import divide
@@ -27,17 +27,14 @@ from rsjax.models.diffusion import latents as distributions
 from rsjax.models.irasim import pretrained
 from rsjax.models.irasim.config import KLConfig
 from rsjax.tokenizers import magvit2, vae_blocks
-from rsjax.tokenizers.autoencoder import Autoencoder
 from rsjax.tokenizers.codec import images_per_pass, in_chunks
 from rsjax.tokenizers.flops import traced_flops
-from rsjax.tokenizers.lpips import lpips
 from rsjax.tokenizers.magvit2 import to_frames, to_unit
-from rsjax.tokenizers.training import TokenizerImages, image_batch, lpips_weights, require_no_adversarial
+from rsjax.tokenizers.training import TokenizerImages, image_batch, require_no_adversarial
 from rsjax.tokenizers.vae_blocks import Map
-from rsjax.trainable import Extra, Params, StepContext, Term
+from rsjax.trainable import Params
 
 Images = Float[Array, "B H W 3"]
-Batch = dict[str, Any]  # images 0–255 (B, H, W, 3) and index (B,), which determines an image's noise
 Latents = Float[Array, "B h w z"]
 
 SDXL_FACTOR = 0.13025  # the public code multiplies latents by it
@@ -101,12 +98,10 @@ def decode(config: KLConfig, params: Params, latents: Latents) -> Images:
 
 
 @dataclass(frozen=True)
-class KLTraining(Autoencoder[Batch]):
+class KLTraining(distributions.PosteriorTraining):
     """Trains the autoencoder to reconstruct RGB frames from a sample of their posterior."""
 
     config: KLConfig
-    train: TokenizerTrainConfig
-    image_size: int
 
     def __post_init__(self) -> None:
         require_no_adversarial(self.train, "IRASim's autoencoder")
@@ -116,39 +111,22 @@ class KLTraining(Autoencoder[Batch]):
         """Returns the training of the autoencoder of a configuration whose model is IRASim."""
         return cls(config.autoencoder, config.tokenizer_train, config.clips.image_size)
 
-    @property
-    def loss_weights(self) -> dict[str, float]:
-        weights = {name: w for name, w in self.train.loss_weights.items() if name in ("l1", "l2", "perceptual")}
-        return weights | {"kl": self.config.kl_weight, "standard": 1.0}
-
     def init(self, key: Key[Array, ""]) -> Params:
         return init(self.config, key)
 
-    def init_extra(self) -> Extra:
-        if "perceptual" not in self.loss_weights:
-            return None
-        return {"lpips": lpips_weights(self.train, self.image_size)}
+    def posterior(self, params: Params, frames: Images) -> tuple[Latents, Latents]:
+        return posterior(self.config, params, frames)
 
-    def loss_terms(self, params: Params, batch: Batch, key: Key[Array, ""], context: StepContext) -> dict[str, Term]:
-        """Returns the terms of :func:`rsjax.models.diffusion.latents.means_of_terms`, and "perceptual" if it is on."""
-        images = to_unit(batch["images"])
-        mean, log_variance = posterior(self.config, params, images)
-        latents = distributions.draw(mean, log_variance, key, batch["index"])
-        output = decode(self.config, params, latents)
-        means = distributions.means_of_terms(images, output, mean, log_variance, latents, params["latents"])
-        if "perceptual" in self.loss_weights:
-            assert context.extra is not None
-            means["perceptual"] = jnp.mean(lpips(context.extra["lpips"], images, output))
-        count = jnp.float32(len(images))
-        return {name: (means[name] * count, count) for name in self.loss_weights}
+    def decode(self, params: Params, latents: Latents) -> Images:
+        return decode(self.config, params, latents)
 
     def transform(self) -> Transform:
         return TokenizerImages(self.train.frames_per_clip, 0.0, "linear", self.train.flip)
 
-    def batch(self, arrays: Arrays) -> Batch:
+    def batch(self, arrays: Arrays) -> distributions.Batch:
         count = arrays["images"].shape[1]  # frames of a clip
         index = count * arrays["index"][:, None] + np.arange(count, dtype=np.int32)
-        return {"images": image_batch(arrays), "index": index.reshape(-1)}
+        return {"frames": image_batch(arrays), "index": index.reshape(-1)}
 
     def codec(self, params: Params, normalization: Normalization) -> "KLCodec":
         return KLCodec(self.config, params)

@@ -17,11 +17,11 @@ import jax
 
 from rsjax.config import ConfigError, from_dict, to_dict
 from rsjax.files import parse_json
+from rsjax.models.ivideogpt.conditional_vq import ConditionalVQ
 from rsjax.models.ivideogpt.config import ConditionalVQConfig, IVideoGPTConfig
 from rsjax.models.ivideogpt.llama import Architecture, LLaMA
 from rsjax.models.ivideogpt.sequence import Layout
 from rsjax.models.saved import Inputs, read_model, saved_inputs
-from rsjax.tokenizers.conditional_vq import ConditionalVQ
 from rsjax.tools.convert.directory import Part, save_part, saved_part
 from rsjax.tools.convert.files import (
     REPLACES,

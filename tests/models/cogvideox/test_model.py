@@ -18,6 +18,7 @@ from rsjax.config.config_fields import with_values
 from rsjax.data.normalization import Normalization
 from rsjax.errors import UserError
 from rsjax.models.base import Assets, create_autoencoder, create_model
+from rsjax.models.cogvideox import causal_vae as vae
 from rsjax.models.cogvideox.autoencoder import CausalCodec, filled
 from rsjax.models.cogvideox.config import CogVideoXConfig, GuidedDenoiseConfig, TextConfig, latent_frames, padded_frames
 from rsjax.models.cogvideox.model import latent_arrays
@@ -27,7 +28,6 @@ from rsjax.models.cogvideox.text import check_tasks, read_texts, texts_of, write
 from rsjax.models.cogvideox.transformer import Architecture, forward_flops, shapes
 from rsjax.models.diffusion.config import NoiseConfig
 from rsjax.models.diffusion.schedule import alphas
-from rsjax.tokenizers import causal_vae as vae
 from rsjax.tools.bench import inputs
 from rsjax.tools.describe import describe
 from rsjax.tools.pipeline.run import Run

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from rsjax.models.cogvideox import autoencoder
+from rsjax.models.cogvideox import causal_vae as vae
 from rsjax.models.cogvideox.config import CausalVAEConfig, CogVideoXConfig, GuidedDenoiseConfig, TextConfig
 from rsjax.models.cogvideox.transformer import Architecture, Transformer, shapes
 from rsjax.models.diffusion.samplers import denoise, sampler_coefficients
 from rsjax.models.diffusion.schedule import alphas
-from rsjax.tokenizers import causal_vae as vae
 from rsjax.tools.convert import cogvideox as convert
 from rsjax.tools.convert.table import to_tensors
 

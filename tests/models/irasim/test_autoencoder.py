@@ -96,7 +96,7 @@ def test_statistics_fit_best_at_those_of_the_latents_and_nothing_else_follows_th
     autoencoder: Any = create_autoencoder(toy.config())
     params, key = jax.jit(autoencoder.init)(jax.random.key(0)), jax.random.key(0)
     images = jnp.asarray(RNG.integers(0, 256, (2, 64, 64, 3), np.uint8))
-    batch, context = {"images": images, "index": jnp.array([4, 7])}, StepContext(jnp.int32(0), None, None)
+    batch, context = {"frames": images, "index": jnp.array([4, 7])}, StepContext(jnp.int32(0), None, None)
 
     @jax.jit
     def gradient(latents: Any) -> Any:
@@ -133,7 +133,7 @@ def test_terms_are_those_with_a_weight() -> None:
     terms = jax.eval_shape(
         autoencoder.loss_terms,
         autoencoder.shapes(),
-        {"images": jax.ShapeDtypeStruct((2, 64, 64, 3), np.uint8), "index": jax.ShapeDtypeStruct((2,), np.int32)},
+        {"frames": jax.ShapeDtypeStruct((2, 64, 64, 3), np.uint8), "index": jax.ShapeDtypeStruct((2,), np.int32)},
         jax.random.key(0),
         StepContext(jnp.int32(0), None, None),
     )

@@ -12,8 +12,8 @@ from rsjax.clip import Video
 from rsjax.config import ConfigError, TokenizerTrainConfig
 from rsjax.layers.cpu import convolution
 from rsjax.models.ivideogpt.autoencoder import ConditionalCodec, ConditionalVQTraining
+from rsjax.models.ivideogpt.conditional_vq import Codebook, ConditionalVQ
 from rsjax.models.ivideogpt.config import ConditionalVQConfig
-from rsjax.tokenizers.conditional_vq import Codebook, ConditionalVQ
 from rsjax.tools.convert.ivideogpt import infer_tokenizer, tokenizer_from_public, tokenizer_shapes, tokenizer_table
 from rsjax.tools.convert.table import public_shapes, to_tensors
 from rsjax.tools.describe import count
