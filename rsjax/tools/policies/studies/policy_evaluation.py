@@ -32,6 +32,8 @@ NUMBERS = {
     "spearman": "Spearman",
     "mmrv": "MMRV",
 }
+AGREEMENT_HEAD = ("run", "Pearson r", "95 %", *NUMBERS.values(), "bias", "same outcome", "uninterpretable")
+SUCCESS_HEAD = ("policy", "in", "success", "95 %", "uninterpretable", "numbers clipped")
 FORMULAS = (
     "x: success in the simulator, y: in the world model. R² of y = x is 1 - Σ(y - x)² / Σ(y - ȳ)²; R² of y for x, a "
     "prediction of x, is 1 - Σ(y - x)² / Σ(x - x̄)². Where y spreads more than x, the first is higher; signs may differ."
@@ -160,33 +162,21 @@ def _title(row: Mapping[str, Any]) -> str:
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
     """Returns the results in Markdown: agreement, success, and the judges that decided success."""
-    lines = [as_markdown(_agreement_table(rows)), "", FORMULAS, "", as_markdown(_success_table(rows))]
-    for number, row in enumerate(rows):
-        if row["judge"] not in [before["judge"] for before in rows[:number]]:
-            lines += markdown(row["judge"])
-    return "\n".join([*lines, ""])
-
-
-def _agreement_table(rows: Sequence[Mapping[str, Any]]) -> Table:
-    lines = []
+    agreements = []
     for row in rows:
         if "pearson" in row:
             value, low, high = (row["pearson"][name] for name in ("value", "low", "high"))
-            if low is None or high is None:
+            if value is None:
+                bounds = "no variation"
+            elif low is None or high is None:
                 bounds = ""
             else:
                 bounds = f"{low:.2f} … {high:.2f}"
             numbers = [value, *(row[name] for name in NUMBERS)]
             r, *others = [ABSENT if number is None else f"{number:.3f}" for number in numbers]
             shares = [f"{100 * row[name]:.0f} %" for name in ("same_outcome", "uninterpretable")]
-            bounds = "no variation" if value is None else bounds
-            lines.append([row["run"], r, bounds, *others, f"{row['bias']:+.3f}", *shares])
-    return Table(("run", "Pearson r", "95 %", *NUMBERS.values(), "bias", "same outcome", "uninterpretable"), lines)
-
-
-def _success_table(rows: Sequence[Mapping[str, Any]]) -> Table:
-    """Returns the success of each policy in the simulator, which is the same for all runs, and in each run's model."""
-    lines = []
+            agreements.append([row["run"], r, bounds, *others, f"{row['bias']:+.3f}", *shares])
+    successes = []  # the simulator's are the same for all runs
     for number, row in enumerate(rows):
         for world in ("simulator", "world_model") if not number else ("world_model",):
             for name, each in row["policies"].items():
@@ -197,5 +187,15 @@ def _success_table(rows: Sequence[Mapping[str, Any]]) -> Table:
                     place = row["run"]
                     unclear = percent(wilson(sum(each["uninterpretable"]), len(each["uninterpretable"])))
                 clipped = str(each["clipped"][world])
-                lines.append([name, place, percent(share), interval_text(share), unclear, clipped])
-    return Table(("policy", "in", "success", "95 %", "uninterpretable", "numbers clipped"), lines)
+                successes.append([name, place, percent(share), interval_text(share), unclear, clipped])
+    lines = [
+        as_markdown(Table(AGREEMENT_HEAD, agreements)),
+        "",
+        FORMULAS,
+        "",
+        as_markdown(Table(SUCCESS_HEAD, successes)),
+    ]
+    for number, row in enumerate(rows):
+        if row["judge"] not in [before["judge"] for before in rows[:number]]:
+            lines += markdown(row["judge"])
+    return "\n".join([*lines, ""])
