@@ -5,7 +5,6 @@ import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from datetime import UTC, datetime
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,7 @@ from rsjax.evaluation.evaluate import EvaluationClips
 from rsjax.evaluation.metrics.physics_iq import THRESHOLD
 from rsjax.evaluation.protocols import Protocol, find, label, of_run
 from rsjax.evaluation.results import NAME, Evaluation, fingerprint, read_result, result_of, write_result
-from rsjax.files import FileError, disk_guard, lock, safe_id
+from rsjax.files import FileError, disk_guard, making, safe_id
 from rsjax.models.load_run import load, load_config
 from rsjax.models.trained import TrainedModel
 from rsjax.progress import note
@@ -123,7 +122,6 @@ def evaluate_into(
     key = _key(trained, store, eval_clips)
     parts = _parts(folder, key)
     skipped = f"{folder}: up to date, skipped (--overwrite evaluates again)"
-    alone = partial(lock, folder / ".lock", wait=f"{folder}: waiting for another process that evaluates here")
     if not overwrite and _key_of(folder) == key:
         if is_lead():
             note(skipped)
@@ -131,7 +129,7 @@ def evaluate_into(
         return
 
     def clear() -> None:
-        with alone():
+        with making(folder, wait=True):
             shutil.rmtree(parts, ignore_errors=True)
 
     if overwrite:  # an interrupted evaluation's batches may be from another version
@@ -143,7 +141,7 @@ def evaluate_into(
         barrier("generation")
 
     def finish() -> None:
-        with alone():
+        with making(folder, wait=True):
             if overwrite or _key_of(folder) != key:
                 _evaluate(folder, name, key, trained, run, store, eval_clips)
             else:  # another process made it while this one waited

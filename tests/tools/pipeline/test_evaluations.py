@@ -198,16 +198,16 @@ def test_who_waited_for_the_lock_takes_what_the_other_process_made(
     made, whole, left = folder / "result.json", (folder / "result.json").read_bytes(), folder / "parts-of-another"
     made.unlink()
     left.mkdir()
-    real, seen = evaluations.lock, []
+    real, seen = evaluations.making, []
 
     @contextlib.contextmanager
-    def waiting(*args: Any, **options: Any) -> Iterator[bool]:
+    def waiting(path: Path, wait: bool) -> Iterator[None]:
         seen.append(left.exists())  # --overwrite deletes in the lock alone
-        with real(*args, **options) as taken:
+        with real(path, wait):
             made.write_bytes(whole)
-            yield taken
+            yield
 
-    monkeypatch.setattr(evaluations, "lock", waiting)
+    monkeypatch.setattr(evaluations, "making", waiting)
     monkeypatch.setattr(evaluations, "_parts", lambda folder, key: left)
     MADE.clear()
     assert evaluated(run) == [folder]
