@@ -46,8 +46,8 @@ def main() -> None:
 
     run = Run(config, options.run_dir or Path("runs") / config.name, options.data_dir)
     with ExitStack() as stack:
-        distributed.on_lead("run directory", lambda: stack.enter_context(run.locked()))
-        distributed.on_lead("run directory", lambda: run.prepare(options.overwrite))
+        distributed.on_lead("run directory", stack.enter_context, run.locked())
+        distributed.on_lead("run directory", run.prepare, options.overwrite)
         run_all(run, options.resume, command=shlex.join([*PROG.split(), *sys.argv[1:]]))
     if distributed.is_lead():
         print(f"report: {run.output('report').absolute()}")

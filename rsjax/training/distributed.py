@@ -175,8 +175,8 @@ def anywhere(flag: bool) -> bool:
     return bool(np.any(multihost_utils.process_allgather(np.asarray(flag))))
 
 
-def on_lead(name: str, work: Callable[[], None]) -> None:
-    """Does ``work`` on the lead while the others wait. If it fails, it fails on all processes.
+def on_lead(name: str, work: Callable[..., object], *arguments: Any) -> None:
+    """Calls ``work(*arguments)`` on the lead while the others wait. If it fails, it fails on all processes.
 
     Raises:
         HostsError: on the others, if it failed on the lead.
@@ -185,7 +185,7 @@ def on_lead(name: str, work: Callable[[], None]) -> None:
     failure: BaseException | None = None
     if is_lead():
         try:
-            work()
+            work(*arguments)
         except BaseException as error:
             if jax.process_count() == 1:
                 raise

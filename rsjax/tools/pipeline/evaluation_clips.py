@@ -88,10 +88,7 @@ def _simulated(what: str, make: Callable[[Report], T]) -> T:
             progress.total = total
             progress.update(done)
 
-        def work() -> None:
-            make(report)
-
-        on_lead("simulation", work)
+        on_lead("simulation", make, report)
         return make(report)
 
 

@@ -1,7 +1,6 @@
 """The stages of the pipeline. Each reads the output of the previous one and can be run again."""
 
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -41,7 +40,7 @@ def run_all(run: Run, resume: bool = True, command: str = "") -> None:
         command: the command that repeats the run, for ``run.json`` and the report.
     """
     check_before_start(run)
-    on_lead("run.json", partial(note_changes, run, command))
+    on_lead("run.json", note_changes, run, command)
     if _begins(run, "collect", _where_clips_come_from(run)):
         _do(run, "collect", collect_clips)
     if _begins(run, "tokenizer", "training the tokenizer"):
@@ -69,19 +68,19 @@ def _begins(run: Run, name: str, title: str) -> bool:
 
 def _do(run: Run, name: str, work: Callable[..., None], *arguments: Any) -> None:
     """Does a stage's work: a training in all processes, everything else in the lead, which also marks the stage."""
-
-    def marked() -> None:
-        with run.stage(name):
-            work(run, *arguments)
-        record_data(run)
-
     if name not in TRAINED:
-        on_lead(name, marked)
+        on_lead(name, _mark_and_do, run, name, work, *arguments)
     elif is_lead():
-        marked()
+        _mark_and_do(run, name, work, *arguments)
     else:
         work(run, *arguments)
     barrier(name)
+
+
+def _mark_and_do(run: Run, name: str, work: Callable[..., None], *arguments: Any) -> None:
+    with run.stage(name):
+        work(run, *arguments)
+    record_data(run)
 
 
 def check_before_start(run: Run) -> None:
