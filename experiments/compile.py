@@ -10,6 +10,7 @@ from typing import Literal
 from experiments.cli import main_errors, parse
 from rsjax.errors import UserError
 from rsjax.files import write_file, write_json
+from rsjax.runtime import set_xla_flags
 from rsjax.tools.compile import targets
 
 PROG = "python -m experiments.compile"
@@ -40,6 +41,7 @@ def main() -> None:
     description = "Compiles for accelerators that are not here, and says what they could do at most."
     config, options = parse(sys.argv[1:], PROG, description, Options())
     target = targets.find(options.target)
+    set_xla_flags()  # as training does
     enter_environment(target.card.platform)
     from rich.console import Console
 

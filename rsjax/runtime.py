@@ -33,7 +33,8 @@ CACHE_DIRECTORY = "JAX_COMPILATION_CACHE_DIR"
 CACHE_SIZE = 4 * 2**30  # bytes of compiled programs that are kept
 BF16_UNITS = {"avx512_bf16", "amx_bf16", "bf16"}  # as x86 and Arm processors name them
 YNNPACK = "--xla_cpu_experimental_ynn_fusion_type"  # the operations that XLA hands to this library
-KNOW_IT = ("0.10.", "0.11.", "0.12.")  # versions of jaxlib that have this flag; an unknown flag would end the process
+TRITON_PRODUCTS = "--xla_gpu_enable_triton_gemm"
+KNOWN = ("0.10.", "0.11.", "0.12.")  # versions of jaxlib that have these flags; an unknown flag would end the process
 
 
 def tune_process() -> None:
@@ -59,18 +60,27 @@ def tune_process() -> None:
 
 
 def set_xla_flags() -> None:
-    """Keeps convolutions from YNNPACK on x86 processors, and matrix products on those without bf16 units.
+    """Chooses libraries for products and convolutions. Leaves flags alone that the user set.
 
-    YNNPACK convolves on one core only. Where it has no bf16 units, XLA's own products of bf16 operands are twice as
-    fast (``notebooks/cpu-performance.md``). Sums and maxima stay with YNNPACK. Does nothing if the user set this flag.
+    On x86 processors, keeps convolutions from YNNPACK, and matrix products where there are no bf16 units. YNNPACK
+    convolves on one core only. Without bf16 units, XLA's own products of bf16 operands are twice as fast
+    (``notebooks/cpu-performance.md``). Sums and maxima stay with YNNPACK.
+
+    On GPUs, leaves matrix products to cuBLAS, which adds bias and residual in the same kernel; XLA's own do not.
     """
-    flags = os.environ.get("XLA_FLAGS", "")
-    if platform.machine() != "x86_64" or YNNPACK in flags:
+    if not version("jaxlib").startswith(KNOWN):
         return
-    if version("jaxlib").startswith(KNOW_IT):
+    flags = os.environ.get("XLA_FLAGS", "").split()
+    if platform.machine() == "x86_64":
         kinds = ["REDUCE", "DOT", "INDIVIDUAL_DOT"] if has_bf16_units() else ["REDUCE"]
-        names = ",".join(f"LIBRARY_FUSION_TYPE_{kind}" for kind in kinds)
-        os.environ["XLA_FLAGS"] = f"{flags} {YNNPACK}={names}".strip()
+        flags = _with_flag(flags, YNNPACK, ",".join(f"LIBRARY_FUSION_TYPE_{kind}" for kind in kinds))
+    os.environ["XLA_FLAGS"] = " ".join(_with_flag(flags, TRITON_PRODUCTS, "false"))
+
+
+def _with_flag(flags: list[str], name: str, value: str) -> list[str]:
+    if any(flag.startswith(name) for flag in flags):
+        return flags
+    return [*flags, f"{name}={value}"]
 
 
 def has_bf16_units() -> bool:

@@ -6,7 +6,9 @@ from pathlib import Path
 import pytest
 
 from rsjax import runtime
-from rsjax.runtime import HUGE_PAGES, YNNPACK, set_xla_flags, tune_process
+from rsjax.runtime import HUGE_PAGES, TRITON_PRODUCTS, YNNPACK, set_xla_flags, tune_process
+
+CUBLAS = f"{TRITON_PRODUCTS}=false"
 
 ROOT = Path(__file__).parents[1]
 # A program that prints its tunables and arguments, and appends its process id to a file at each start.
@@ -68,22 +70,31 @@ def test_compiled_programs_are_kept_in_the_users_cache_unless_told_otherwise(
 @pytest.mark.parametrize(
     ("processor", "machine", "jaxlib", "before", "after"),
     [
-        ("flags : fma avx512f", "x86_64", "0.10.2", "", f"{YNNPACK}=LIBRARY_FUSION_TYPE_REDUCE"),
-        ("flags : fma avx512f", "x86_64", "0.10.2", "--a=1", f"--a=1 {YNNPACK}=LIBRARY_FUSION_TYPE_REDUCE"),
-        ("flags : fma avx512f", "x86_64", "0.10.2", f"{YNNPACK}=X", f"{YNNPACK}=X"),
+        ("flags : fma avx512f", "x86_64", "0.10.2", "", f"{YNNPACK}=LIBRARY_FUSION_TYPE_REDUCE {CUBLAS}"),
+        ("flags : fma avx512f", "x86_64", "0.10.2", "--a=1", f"--a=1 {YNNPACK}=LIBRARY_FUSION_TYPE_REDUCE {CUBLAS}"),
+        ("flags : fma avx512f", "x86_64", "0.10.2", f"{YNNPACK}=X", f"{YNNPACK}=X {CUBLAS}"),
         (
             "flags : fma avx512f avx512_bf16",
             "x86_64",
             "0.10.2",
             "",
-            f"{YNNPACK}=LIBRARY_FUSION_TYPE_REDUCE,LIBRARY_FUSION_TYPE_DOT,LIBRARY_FUSION_TYPE_INDIVIDUAL_DOT",
+            f"{YNNPACK}=LIBRARY_FUSION_TYPE_REDUCE,LIBRARY_FUSION_TYPE_DOT,LIBRARY_FUSION_TYPE_INDIVIDUAL_DOT {CUBLAS}",
         ),
-        ("Features : asimd", "aarch64", "0.10.2", "", ""),
+        ("Features : asimd", "aarch64", "0.10.2", "", CUBLAS),
+        ("Features : asimd", "aarch64", "0.10.2", f"{TRITON_PRODUCTS}=true", f"{TRITON_PRODUCTS}=true"),
         ("flags : fma avx512f", "x86_64", "0.99.0", "", ""),  # a later jaxlib may not know the flag
     ],
-    ids=["none", "added", "chosen by the user", "bf16 units", "Arm", "a later jaxlib"],
+    ids=[
+        "none",
+        "added",
+        "chosen by the user",
+        "bf16 units",
+        "Arm",
+        "a GPU's",
+        "a later jaxlib",
+    ],
 )
-def test_ynnpack_multiplies_only_where_it_is_not_slower(
+def test_the_libraries_of_products_and_convolutions_are_chosen_unless_the_user_did(
     monkeypatch: pytest.MonkeyPatch, processor: str, machine: str, jaxlib: str, before: str, after: str
 ) -> None:
     monkeypatch.setattr(runtime, "_processor", lambda: processor)
