@@ -1,6 +1,6 @@
 """Linear layers and LayerNorm as in the public PyTorch code."""
 
-from typing import Any
+from typing import Any, TypeAlias
 
 import flax.linen as nn
 import jax.numpy as jnp
@@ -10,6 +10,8 @@ from jaxtyping import Array, Float
 from rsjax.layers.platform import linear
 
 # torch's default for linear layers, U(±1/√fan_in), as in the public code.
+Params: TypeAlias = dict[str, Any]  # a tree of arrays
+
 TORCH_KERNEL = nn.initializers.variance_scaling(1 / 3, "fan_in", "uniform")
 PRODUCT = "product"  # the name of linear layers' outputs in rematerialisation policies
 
@@ -34,6 +36,15 @@ class Dense(nn.Module):
         else:
             out = x @ kernel if bias is None else x @ kernel + bias
         return checkpoint_name(out, PRODUCT)
+
+
+def rounded(params: Params) -> Params:
+    """Rounds linear layers to bf16, as they do themselves in every pass over features in bf16."""
+    if "kernel" in params:
+        return {name: x.astype(jnp.bfloat16) for name, x in params.items()}
+    if "scale" in params:
+        return params
+    return {name: rounded(inner) for name, inner in params.items()}
 
 
 def layer_norm(name: str | None, dtype: Any = jnp.float32) -> nn.LayerNorm:

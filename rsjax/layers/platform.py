@@ -44,9 +44,10 @@ def attend_in_clip(
         q, k, v = (x.swapaxes(1, 2) for x in (q, k, v))
         return attend(q, k, v, jnp.tri(q.shape[-3], dtype=bool)).swapaxes(1, 2)
 
-    if qkv.dtype == jnp.float32 or not gpu.fits(qkv.shape, over):
-        return plain(qkv)
-    return jax.lax.platform_dependent(qkv, cuda=partial(gpu.attend, over=over), default=plain)
+    kernels = {}
+    if qkv.dtype == jnp.bfloat16 and gpu.fits(qkv.shape, over):
+        kernels["cuda"] = partial(gpu.attend, over=over)
+    return jax.lax.platform_dependent(qkv, default=plain, **kernels)
 
 
 def linear(

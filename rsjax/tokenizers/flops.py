@@ -58,7 +58,11 @@ def traced_flops(
 
 
 def products(jaxpr: Any) -> int:
-    """Returns the operations of the products and convolutions in a program; a scan's count once per iteration."""
+    """Returns the operations of the products and convolutions in a program.
+
+    A scan's count once per iteration. Of branches one counts, that with the most: a program runs one of them, such as
+    the implementation for its platform.
+    """
     total = 0
     for eqn in jaxpr.eqns:
         if eqn.primitive.name == "dot_general":
@@ -68,6 +72,9 @@ def products(jaxpr: Any) -> int:
             kernel = eqn.invars[1].aval
             spec = eqn.params["dimension_numbers"].rhs_spec
             total += 2 * eqn.outvars[0].aval.size * kernel.size // kernel.shape[spec[0]]
+        if eqn.primitive.name == "cond":
+            total += max(products(branch.jaxpr) for branch in eqn.params["branches"])
+            continue
         turns = 1
         if eqn.primitive.name == "scan":
             turns = eqn.params["length"]

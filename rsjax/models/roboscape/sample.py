@@ -25,6 +25,7 @@ from jaxtyping import Bool, Float, Int, Key
 
 from rsjax.clip import Array
 from rsjax.config import SampleConfig
+from rsjax.layers.dense import rounded
 from rsjax.layers.unstacked_params import apart, together
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.departures import guidance, mean_codes
@@ -547,7 +548,7 @@ def _repeat_step(
     """Generates frames P to ``frames`` - 1 by repeated :func:`step`."""
     past = prompt["rgb"].shape[1]
     beyond = past + actions.shape[1] > arch.frames
-    params = _unstacked(arch, params)
+    params = for_many_passes(arch, params)
     state = replace(state, cache=apart(state.cache, arch.blocks, arch.unroll))
     known = mean_codes.codes_of(sample, prompt, arch.code_bits) or prompt
     made = {branch: _with_room(cells, actions.shape[1]) for branch, cells in known.items()}
@@ -580,7 +581,7 @@ def _recomputed(
     if not arch.departures.rotary:
         length = arch.frames
     actions = jnp.pad(actions, ((0, 0), (0, length), (0, 0)))
-    params = _unstacked(arch, params)
+    params = for_many_passes(arch, params)
     tokens = {branch: _with_room(cells, total - past + length) for branch, cells in prompt.items()}
     means = mean_codes.codes_of(sample, tokens, arch.code_bits)
 
@@ -613,8 +614,12 @@ def _recomputed(
     return _grids(arch, means or tokens, no_depth)
 
 
-def _unstacked(arch: Architecture, params: Params) -> Params:
-    return params | {"blocks": apart(params["blocks"], arch.blocks, arch.unroll)}
+def for_many_passes(arch: Architecture, params: Params) -> Params:
+    """Returns the parameters as a loop around the network reads them fastest: rounded once, and blocks split."""
+    blocks = params["blocks"]
+    if arch.feature_dtype == "bfloat16":
+        blocks = rounded(blocks)
+    return params | {"blocks": apart(blocks, arch.blocks, arch.unroll)}
 
 
 def _with_room(cells: Array, frames: int) -> Array:

@@ -16,7 +16,7 @@ from rsjax.layers.unstacked_params import apart
 from rsjax.models.base import create_autoencoder, create_model
 from rsjax.models.roboscape.departures import guidance
 from rsjax.models.roboscape.model import RoboScape
-from rsjax.models.roboscape.sample import start, step
+from rsjax.models.roboscape.sample import for_many_passes, start, step
 from rsjax.tokenizers.codec import PIXELS
 from rsjax.tokenizers.magvit2 import Tokenizer
 from rsjax.tools.bench import inputs
@@ -168,10 +168,8 @@ def frame(config: Config, device: Any, clips: int) -> Program:
         tokens = dict.fromkeys(arch.branches, jnp.zeros((clips, PROMPT_FRAMES, config.grid**2), jnp.int32))
         actions = jnp.zeros((clips, PROMPT_FRAMES, arch.action_inputs))
         state = start(arch, sample, params, tokens, actions, jax.random.split(jax.random.key(0), clips), None)
-        blocks = apart(params["blocks"], arch.blocks, arch.unroll)
-        return params | {"blocks": blocks}, dataclasses.replace(
-            state, cache=apart(state.cache, arch.blocks, arch.unroll)
-        )
+        cache = apart(state.cache, arch.blocks, arch.unroll)
+        return for_many_passes(arch, params), dataclasses.replace(state, cache=cache)
 
     def generate(params: Any, state: Any, actions: Any) -> Any:
         return step(arch, sample, params, state, actions, beyond=False)
