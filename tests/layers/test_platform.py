@@ -10,6 +10,7 @@ import pytest
 
 from rsjax.layers import accelerator, platform
 from rsjax.layers.cpu.matmul import matmul_bf16
+from rsjax.layers.dense import Dense, rounded
 
 CONVOLUTION = {"window_strides": (1, 1), "padding": "SAME", "dimension_numbers": ("NHWC", "HWIO", "NHWC")}
 
@@ -51,3 +52,16 @@ def test_both_products_have_the_same_values_gradients_and_number_formats(dtype: 
     for x, y in zip((found, *pull(cotangent)), (expected, *other_pull(cotangent)), strict=True):
         assert x.dtype == y.dtype
         np.testing.assert_allclose(x.astype(jnp.float32), y.astype(jnp.float32), rtol=0.01, atol=0.01)
+
+
+def test_weights_that_are_rounded_once_give_what_layers_that_round_them_give() -> None:
+    x = numbers(5, 8).astype(jnp.bfloat16)
+    layer = Dense(4, bf16=True)
+    params = layer.init(jax.random.key(0), x)["params"] | {"bias": numbers(4)}
+    tree = {"fc": params, "norm": {"scale": numbers(3), "bias": numbers(3)}}
+    once = rounded(tree)
+    np.testing.assert_array_equal(
+        layer.apply({"params": once["fc"]}, x),  # type: ignore[arg-type]
+        layer.apply({"params": params}, x),  # type: ignore[arg-type]
+    )
+    assert once["norm"] is tree["norm"]

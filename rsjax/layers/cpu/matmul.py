@@ -14,10 +14,10 @@ from rsjax import runtime
 def linear(x: Float[Array, "N K"], w: Float[Array, "K M"], bias: Float[Array, " M"] | None) -> Float[Array, "N M"]:
     """Returns x·w + bias by :func:`matmul_bf16`, or in float32 on CPUs without bf16 units, where this is as fast."""
     multiply = matmul_bf16 if runtime.has_bf16_units() else jnp.matmul
-    out = multiply(x, w)
-    if bias is not None:
-        out = out + bias
-    return out.astype(x.dtype)
+    out = multiply(x, w).astype(x.dtype)
+    if bias is None:
+        return out
+    return out + bias.astype(x.dtype)
 
 
 @jax.custom_vjp
