@@ -255,13 +255,13 @@ def test_actions_into_recorded_frames_stay_the_clips_own(teacher_forced: bool) -
 
 def test_clips_that_are_too_short_or_small_are_refused(clips: Store, trained: TrainedModel) -> None:
     shape, long = trained.config.clips, find("horizon48", trained.config)
-    with pytest.raises(UserError, match=f"predicts 48 frames after 1, so it takes clips of 49 .* have {shape.frames}"):
-        EvaluationClips.read(clips, "test", long, shape)
-    with pytest.raises(UserError, match=f"scores frames of 99 pixels per side; .* have {shape.image_size}"):
-        EvaluationClips.read(
-            clips, "test", replace(find("ivideogpt-bair", trained.config), horizon=1, resolution=99), shape
-        )
+    large = replace(find("ivideogpt-bair", trained.config), horizon=1, resolution=99)
+    for split, protocol, message in (
+        ("test", long, f"predicts 48 frames after 1, so it takes clips of 49 .* have {shape.frames}"),
+        ("test", large, f"scores frames of 99 pixels per side; .* have {shape.image_size}"),
+        ("unseen", of_run(trained.config), "no split 'unseen'; it has train, test"),
+    ):
+        with pytest.raises(UserError, match=message):
+            EvaluationClips.read(clips, split, protocol, shape)
     with pytest.raises(UserError, match="unknown protocol 'papr'; did you mean 'paper'"):
         find("papr", trained.config)
-    with pytest.raises(StoreError, match="no split 'unseen'; it has train, test"):
-        EvaluationClips.read(clips, "unseen", of_run(trained.config), shape)

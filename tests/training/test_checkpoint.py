@@ -1,6 +1,6 @@
 import gc
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -124,16 +124,19 @@ def test_weights_stay_until_those_that_replace_them_are_whole(tmp_path: Path, mo
 
 def test_weights_that_are_missing_other_or_damaged_are_named(tmp_path: Path) -> None:
     path, like = tmp_path / "weights", Regression().init(jax.random.key(0))
-    with pytest.raises(CheckpointError, match=rf"{path}: no such weights; train first"):
-        load_weights(path, like)
-    save_weights(path, like)
-    for other in (Regression(2).init(jax.random.key(0)), like | {"more": like["b"]}, {"w": like["w"]}):
-        with pytest.raises(CheckpointError, match=rf"{path}: does not fit"):
-            load_weights(path, other)
-    truncate_largest(path)
-    with pytest.raises(CheckpointError, match=rf"{path}: .*damaged"):
-        load_weights(path, like)
-    for file in filter(Path.is_file, path.rglob("*")):
-        file.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:4d7a2146\nsize 12345\n")
-    with pytest.raises(CheckpointError, match=rf"{path}/.*: a Git-LFS pointer .* git lfs pull"):
-        load_weights(path, like)
+
+    def put_pointers() -> None:
+        for file in filter(Path.is_file, path.rglob("*")):
+            file.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:4d7a2146\nsize 12345\n")
+
+    others = (Regression(2).init(jax.random.key(0)), like | {"more": like["b"]}, {"w": like["w"]})
+    cases: tuple[tuple[Callable[[], object], Any, str], ...] = (
+        (lambda: None, like, ": no such weights; train first"),
+        *((lambda: save_weights(path, like), other, ": does not fit") for other in others),
+        (lambda: truncate_largest(path), like, ": .*damaged"),
+        (put_pointers, like, "/.*: a Git-LFS pointer .* git lfs pull"),
+    )
+    for prepare, wanted, message in cases:
+        prepare()
+        with pytest.raises(CheckpointError, match=f"{path}{message}"):
+            load_weights(path, wanted)

@@ -65,8 +65,6 @@ def test_what_cannot_be_rendered_is_refused_with_the_cure(gl: str, tmp_path: Pat
     path = write_states(tmp_path / "c.hdf5", scene(), states=np.zeros((COUNT + 1, 3)))
     with pytest.raises(EpisodeError, match="camera agentview has 6 rows, timestamps 5"):
         read_first("robomimic", path)
-    with pytest.raises(SourceError, match="option size is 4; choose one from 8 to 1024"):
-        open_source("robomimic", path, size=4)
 
 
 def test_robosuites_own_demos_are_read(gl: str) -> None:

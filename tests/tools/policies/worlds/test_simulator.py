@@ -1,6 +1,7 @@
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -92,9 +93,11 @@ def test_actions_are_clipped_and_counted_or_refused(env: LiftEnv) -> None:
     with pytest.raises(ActionError, match=r"actions\[3\] is 1.5; expected -1 to 1, 6-D change"):
         strict.step(wide)
     strict.close()
-    with pytest.raises(ActionError, match=r"shape \(7,\); expected \(28,\)"):
-        env.step(np.zeros(7))
-    with pytest.raises(ActionError, match=r"actions\[5\] is nan"):
-        env.step(np.where(np.arange(28) == 5, np.nan, 0))
-    with pytest.raises(ActionError, match="an action is str"):
-        env.step("left")
+    wrong: tuple[tuple[Any, str], ...] = (
+        (np.zeros(7), r"shape \(7,\); expected \(28,\)"),
+        (np.where(np.arange(28) == 5, np.nan, 0), r"actions\[5\] is nan"),
+        ("left", "an action is str"),
+    )
+    for action, message in wrong:
+        with pytest.raises(ActionError, match=message):
+            env.step(action)
