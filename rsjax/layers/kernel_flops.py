@@ -32,4 +32,6 @@ KERNEL_FLOPS: dict[str, Callable[[Shapes, Shapes], float]] = {
     "attend_cells_backward": lambda operands, results: gpu_attention.flops(operands[0], "cells")[1],
     "attend_frames_forward": lambda operands, results: gpu_attention.flops(operands[0], "frames")[0],
     "attend_frames_backward": lambda operands, results: gpu_attention.flops(operands[0], "frames")[1],
+    "add_norm_forward": lambda operands, results: 0,  # no products
+    "add_norm_backward": lambda operands, results: 0,
 }

@@ -12,14 +12,17 @@ from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array
 
 from rsjax.layers.gpu.attention import attend
+from rsjax.layers.gpu.layer_norm import add_norm
 
 
 def loss(qkv: Array) -> Array:
-    return jnp.sum(attend(qkv, "cells", interpret=True) ** 2)
+    out = attend(qkv, "cells", interpret=True)
+    total, normed = add_norm(out.reshape(len(out), -1, 128), None, jnp.full(128, 2.0), jnp.ones(128), interpret=True)
+    return jnp.sum(total * normed**2)
 
 
 def main() -> None:
-    qkv = jax.random.normal(jax.random.key(0), (4, 2, 16, 3, 2, 16))
+    qkv = jax.random.normal(jax.random.key(0), (4, 4, 64, 3, 8, 16))
     truth = jax.grad(loss)(qkv)
     mesh = Mesh(np.array(jax.devices()), ("data",), axis_types=(AxisType.Auto,))
     clips = NamedSharding(mesh, PartitionSpec("data"))
