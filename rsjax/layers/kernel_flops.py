@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from math import prod
 
-from rsjax.layers.gpu import attention as gpu_attention
+from rsjax.layers import packed_attention
 
 Shapes = Sequence[tuple[int, ...]]
 
@@ -28,10 +28,10 @@ KERNEL_FLOPS: dict[str, Callable[[Shapes, Shapes], float]] = {
     "mha_forward": attention(2),  # jax.experimental.pallas.ops.gpu.attention
     "mha_preprocess_backward": lambda operands, results: 2 * prod(operands[0]),
     "mha_backward": attention(5),
-    "attend_cells_forward": lambda operands, results: gpu_attention.flops(operands[0], "cells")[0],
-    "attend_cells_backward": lambda operands, results: gpu_attention.flops(operands[0], "cells")[1],
-    "attend_frames_forward": lambda operands, results: gpu_attention.flops(operands[0], "frames")[0],
-    "attend_frames_backward": lambda operands, results: gpu_attention.flops(operands[0], "frames")[1],
+    "attend_cells_forward": lambda operands, results: packed_attention.flops(operands[0], "cells")[0],
+    "attend_cells_backward": lambda operands, results: packed_attention.flops(operands[0], "cells")[1],
+    "attend_frames_forward": lambda operands, results: packed_attention.flops(operands[0], "frames")[0],
+    "attend_frames_backward": lambda operands, results: packed_attention.flops(operands[0], "frames")[1],
     "add_norm_forward": lambda operands, results: 0,  # no products
     "add_norm_backward": lambda operands, results: 0,
 }

@@ -20,6 +20,7 @@ from rsjax.layers.attention import attend, unpacked
 from rsjax.layers.cpu import convolution, frame_attention
 from rsjax.layers.cpu import matmul as cpu_matmul
 from rsjax.layers.gpu import attention as gpu
+from rsjax.layers.tpu import attention as tpu
 
 
 def by_platform(cpu: Callable[..., Any], accelerator: Callable[..., Any], *operands: Any) -> Any:
@@ -47,6 +48,8 @@ def attend_in_clip(
     kernels = {}
     if qkv.dtype == jnp.bfloat16 and gpu.fits(qkv.shape, over):
         kernels["cuda"] = partial(gpu.attend, over=over)
+    if qkv.dtype == jnp.bfloat16 and tpu.fits(qkv.shape, over):
+        kernels["tpu"] = partial(tpu.attend, over=over)
     return jax.lax.platform_dependent(qkv, default=plain, **kernels)
 
 
