@@ -3,8 +3,9 @@
 A tile is a frame, or all frames of a few neighbouring cells. A program has the packed queries, keys and values of all
 heads of its tile on chip, so that scores, transposes and copies never go to memory. Heads lie side by side along lanes
 as the projection wrote them; an array with an axis of 32 channels a head would be padded to 128 lanes in memory, and
-moved. Heads are not cut out on chip either: the product of all 128 lanes of keys with queries whose other lanes are
-zero is that of one head, and as fast, since a matrix unit multiplies 128 lanes at once anyway.
+moved. Nor are heads cut out of lanes on chip: the product of all 128 lanes of keys with queries whose other lanes are
+zero is that of one head, and as fast, since a matrix unit multiplies 128 lanes at once anyway. Scores are (k, q), so
+that sums over keys run across registers, and products with them have only the rows of one head's channels.
 
 The gradient recomputes scores from each row's log-sum (FlashAttention-2, Dao 2023, arXiv 2307.08691).
 
@@ -29,20 +30,22 @@ from rsjax.layers.partition import each_own_clips
 __all__ = ["ATTENTION", "Over", "attend", "fits", "flops"]
 
 LANES = 128
+MOST_CHANNELS = 1024  # of 256 rows, for the memory on chip
 SUBLANES = 8  # rows of a register, which are the cells of a tile over frames
 
 
 def fits(shape: tuple[int, ...], over: Over) -> bool:
     """Returns whether :func:`attend` takes a qkv of this shape (B, T, S, 3, h, e).
 
-    Head widths are 16, 32, 64 or 128, and h·e is a multiple of 128. Over cells, S is 128, 256, 384 or 512. Over frames,
-    T is 16 or 32 and S is a multiple of 8.
+    Head widths are 16, 32, 64 or 128, and h·e is a multiple of 128 and at most 1024. Over cells, S is 128 or 256. Over
+    frames, T is 16 or 32 and S is a multiple of 8.
     """
     _, frames, cells, _, heads, width = shape
-    if width not in HEAD_WIDTHS or heads * width % LANES != 0:
+    channels = heads * width
+    if width not in HEAD_WIDTHS or channels % LANES != 0 or channels > MOST_CHANNELS:
         return False
     if over == "cells":
-        return cells in (128, 256, 384, 512)
+        return cells in (128, 256)
     return frames in (16, 32) and cells % SUBLANES == 0
 
 
@@ -151,24 +154,25 @@ def _forward_kernel(qkv: Any, out: Any, log_sum: Any, *, tile: Tile, width: int)
     heads = LANES // width  # side by side in a register
     lane = jax.lax.broadcasted_iota(jnp.int32, (tile.rows, LANES), 1)
 
-    def step(group: Any, log_sums: Float[Array, "R 128"]) -> Float[Array, "R 128"]:
+    def step(group: Any, _: None) -> None:
         q, k, v = (_rows(qkv, tile, part * channels + group * LANES) for part in range(3))
-        total_out = jnp.zeros(q.shape, jnp.float32)
-        for i in range(heads):
-            own = (lane >= i * width) & (lane < (i + 1) * width)
-            scores = product(jnp.where(own, q, 0), k, 1, 1) * scale(width)
-            if tile.frames > 1:
-                scores = jnp.where(_sees(tile, 0), scores, jnp.finfo(jnp.float32).min)
-            top = jnp.max(scores, axis=1, keepdims=True)
-            weights = jnp.exp2(scores - top)
-            total = jnp.sum(weights, axis=1, keepdims=True)
-            total_out += product(weights.astype(v.dtype), jnp.where(own, v, 0), 1, 0) / total
-            log_sums = jnp.where(lane == group * heads + i, top + jnp.log2(total), log_sums)
-        _put(out, tile, group * LANES, total_out)
-        return log_sums
+        v_t = v.T
+        own = [(lane >= first) & (lane < first + width) for first in range(0, LANES, width)]
+        # Stage by stage, since the compiler does not move one head's products beside another's exponentials.
+        scores = [product(k, jnp.where(mask, q, 0), 1, 1) * scale(width) for mask in own]
+        if tile.frames > 1:
+            scores = [jnp.where(_sees(tile), x, jnp.finfo(jnp.float32).min) for x in scores]
+        outs_t = []
+        for i, x in enumerate(scores):
+            top = jnp.max(x, axis=0, keepdims=True)
+            weights = jnp.exp2(x - top)
+            total = jnp.sum(weights, axis=0, keepdims=True)
+            of_head = slice(i * width, (i + 1) * width)
+            outs_t.append(product(v_t[of_head], weights.astype(v.dtype), 1, 0) / total)
+            log_sum[pl.ds(group * heads + i, 1)] = top + jnp.log2(total)
+        _put_transposed(out, tile, group * LANES, outs_t)
 
-    log_sums = jax.lax.fori_loop(0, channels // LANES, step, jnp.zeros((tile.rows, LANES), jnp.float32))
-    log_sum[...] = log_sums.T[: log_sum.shape[0]]
+    jax.lax.fori_loop(0, channels // LANES, step, None)
 
 
 def _backward_kernel(
@@ -181,23 +185,24 @@ def _backward_kernel(
     def step(group: Any, _: None) -> None:
         q, k, v = (_rows(qkv, tile, part * channels + group * LANES) for part in range(3))
         g = _rows(cotangent, tile, group * LANES)
+        q_t, k_t, g_t = (x.T for x in (q, k, g))
         along = (g.astype(jnp.float32) * _rows(out, tile, group * LANES).astype(jnp.float32)).T
-        to_q, to_k, to_v = (jnp.zeros(q.shape, jnp.float32) for _ in range(3))
+        gradients_t: tuple[list[Array], ...] = ([], [], [])
+        own = [(lane >= first) & (lane < first + width) for first in range(0, LANES, width)]
+        scores = [product(k, jnp.where(mask, q, 0), 1, 1) * scale(width) for mask in own]
+        of_weights = [product(v, jnp.where(mask, g, 0), 1, 1) for mask in own]
         for i in range(heads):
-            own = (lane >= i * width) & (lane < (i + 1) * width)
-            own_q, own_k, own_g = (jnp.where(own, x, 0) for x in (q, k, g))
             of_head = slice(i * width, (i + 1) * width)
-            # Transposed, (k, q): so two products of three need no transposed operand, and sums of rows lie along lanes.
-            weights = jnp.exp2(product(k, own_q, 1, 1) * scale(width) - log_sum[pl.ds(group * heads + i, 1)])
+            weights = jnp.exp2(scores[i] - log_sum[pl.ds(group * heads + i, 1)])
             if tile.frames > 1:
-                weights = jnp.where(_sees(tile, 1), weights, 0.0)
-            of_weights = product(v, own_g, 1, 1)
-            of_scores = (weights * (of_weights - jnp.sum(along[of_head], axis=0, keepdims=True))).astype(q.dtype)
-            to_v += product(weights.astype(g.dtype), own_g, 1, 0)
-            to_k += product(of_scores, own_q, 1, 0)
-            to_q += product(of_scores, own_k, 0, 0)
-        for part, x in enumerate((to_q / math.sqrt(width), to_k / math.sqrt(width), to_v)):
-            _put(gradient, tile, part * channels + group * LANES, x)
+                weights = jnp.where(_sees(tile), weights, 0.0)
+            of_scores = weights * (of_weights[i] - jnp.sum(along[of_head], axis=0, keepdims=True))
+            of_scores = of_scores.astype(q.dtype)
+            gradients_t[0].append(product(k_t[of_head], of_scores, 1, 0) / math.sqrt(width))
+            gradients_t[1].append(product(q_t[of_head], of_scores, 1, 1) / math.sqrt(width))
+            gradients_t[2].append(product(g_t[of_head], weights.astype(g.dtype), 1, 1))
+        for part, heads_t in enumerate(gradients_t):
+            _put_transposed(gradient, tile, part * channels + group * LANES, heads_t)
 
     jax.lax.fori_loop(0, channels // LANES, step, None)
 
@@ -210,14 +215,13 @@ def _rows(tokens: Any, tile: Tile, first: Any) -> Float[Array, "R 128"]:
     return x.astype(jnp.float32).reshape(tile.rows, LANES).astype(x.dtype)  # only float32 fills a register in 8 rows
 
 
-def _put(tokens: Any, tile: Tile, first: Any, x: Float[Array, "R 128"]) -> None:
+def _put_transposed(tokens: Any, tile: Tile, first: Any, heads: list[Float[Array, "e R"]]) -> None:
     """Stores 128 channels of a tile where :func:`_rows` loads them."""
+    x = jnp.concatenate(heads, axis=0).T
     tokens[:, :, pl.ds(pl.multiple_of(first, LANES), LANES)] = x.reshape(*tile, LANES).astype(tokens.dtype)
 
 
-def _sees(tile: Tile, queries: int) -> Array:
-    """Returns the pairs of a query and a key of the same cell and no later frame; queries are on this axis."""
+def _sees(tile: Tile) -> Array:
+    """Returns the pairs, (k, q), of a query and a key of the same cell and no later frame."""
     rows = (tile.rows, tile.rows)
-    query = jax.lax.broadcasted_iota(jnp.int32, rows, queries)
-    key = jax.lax.broadcasted_iota(jnp.int32, rows, 1 - queries)
-    return sees(tile, query, key)
+    return sees(tile, jax.lax.broadcasted_iota(jnp.int32, rows, 1), jax.lax.broadcasted_iota(jnp.int32, rows, 0))
