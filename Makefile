@@ -6,10 +6,10 @@ python := $(VENV)/bin/python
 # When a test ends its process, the run ends, too: in a new process, xdist would run the same test again.
 in_parallel := -n $(JOBS) --max-worker-restart 0
 
-.PHONY: help setup train test extras lint clean
+.PHONY: help setup train test extras accelerators accelerators-test lint clean
 
 help:  ## this list
-	@sed -n 's/^\([a-z]*\):[^#]*## /make \1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 14
+	@sed -n 's/^\([a-z-]*\):[^#]*## /make \1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 24
 
 setup:  ## the environment: pinned packages and, where it is missing, OpenGL
 	@scripts/setup.sh "$(VENV)"
@@ -24,6 +24,12 @@ test: setup  ## the tests
 extras: setup  ## the optional packages (networks, PyTorch, Rerun, a browser), and the tests that want them
 	@scripts/extras.sh "$(VENV)"
 	@"$(VENV)/extras/bin/python" -m pytest $(in_parallel) $$(grep -rlE --include='test_*.py' 'importorskip\("(torch|trans|rerun|playwright|stable)' tests) $(ARGS)
+
+accelerators: setup  ## compilers for GPUs and TPUs that are not here (5.1 GB), for experiments.compile
+	@scripts/accelerators.sh "$(VENV)"
+
+accelerators-test: accelerators  ## the tests that compile for them
+	@"$(VENV)/accelerators/bin/python" -m pytest tests/tools/compile tests/scripts/test_compiled.py $(ARGS)
 
 lint: setup  ## ruff, mypy, and the numbers that may only fall
 	@$(python) -m ruff check
