@@ -22,7 +22,7 @@ class Options:
     """Options of this command."""
 
     target: str = "h100"
-    """The cluster, such as h100, a100x8, rtx4090, v5e-16, v5p-64 (docs/how-to/compile.md lists all)."""
+    """The cluster, such as h100, a100x8, rtx4090, v5e-16, v5p-64 (docs/compile.md lists all)."""
     part: Literal["train", "sample", "tokenizer"] = "train"
     """The training step, a generated frame, or the tokenizer's training step and its encoding."""
     clips: int = 64
@@ -60,20 +60,22 @@ def main() -> None:
     check(results, config, options.part, target)
 
 
-def enter_environment(platform: str) -> None:
+def enter_environment(platform: str, prefix: str = sys.prefix) -> None:
     """Continues in the environment with the compilers, where they are not in this one.
+
+    Args:
+        prefix: the directory of this environment.
 
     Raises:
         UserError: there is no such environment, or it lacks the compiler.
     """
-    os.environ |= targets.ENVIRONMENT
     package, title = PACKAGES[platform]
-    if find_spec(package):
-        return
-    python = Path(sys.prefix) / "accelerators" / "bin" / "python"
-    if not python.exists() or find_spec("jax_cuda13_plugin") or find_spec("libtpu"):
+    python = Path(prefix) / "accelerators" / "bin" / "python"
+    if not find_spec(package) and (not python.exists() or "accelerators" in Path(prefix).name):
         raise UserError(f"the compiler is not installed ({title}); make accelerators installs it, 5 GB in all")
-    os.execve(python, [str(python), *sys.orig_argv[1:]], os.environ)
+    os.environ |= targets.ENVIRONMENT
+    if not find_spec(package):
+        os.execve(python, [str(python), *sys.orig_argv[1:]], os.environ)
 
 
 if __name__ == "__main__":

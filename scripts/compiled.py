@@ -6,7 +6,6 @@ worth a higher cost, or that lowers one, commit what ``--write`` writes.
 """
 
 import json
-import os
 import sys
 from pathlib import Path
 from typing import Any
@@ -34,7 +33,9 @@ def main() -> None:
     enter_environment("cuda")
     costs = {name: measure(name) for name in PROGRAMS}
     for name, cost in costs.items():
-        print(f"{name:<26} {cost['roofline_s'] * 1e3:9.3f} ms {cost['bytes'] / 1e9:9.3f} GB {cost['kernels']:7} kernels")
+        print(
+            f"{name:<26} {cost['roofline_s'] * 1e3:9.3f} ms {cost['bytes'] / 1e9:9.3f} GB {cost['kernels']:7} kernels"
+        )
     if sys.argv[1:] == ["--write"]:
         write_json(TABLE, costs)
     elif worse := [line for name, cost in costs.items() for line in compare(name, cost)]:
@@ -50,8 +51,7 @@ def measure(name: str) -> dict[str, float]:
     from rsjax.tools.compile.targets import find
 
     config, options = parse(PROGRAMS[name].split(), "scripts.compiled", "", Options())
-    quiet = Console(file=Path(os.devnull).open("w"))
-    numbers = run(config, find("h100"), options.part, options.clips, quiet, find_largest=False)[0]
+    numbers = run(config, find("h100"), options.part, options.clips, Console(quiet=True), find_largest=False)[0]
     return {cost: numbers[cost] for cost in COSTS}
 
 

@@ -111,7 +111,11 @@ def test_a_fusion_reads_the_slice_and_writes_the_update_of_a_stack() -> None:
     ("shapes", "settings", "flops"),
     [
         # A kernel of 3 × 3 on 4 × 4 pixels meets 10 of 12 positions along each axis, since padding costs nothing.
-        ("bf16[1,4,4,8] bf16[3,3,8,5] bf16[1,4,4,5]", "window={size=3x3 pad=1_1x1_1}, dim_labels=b01f_01io->b01f", 8000),
+        (
+            "bf16[1,4,4,8] bf16[3,3,8,5] bf16[1,4,4,5]",
+            "window={size=3x3 pad=1_1x1_1}, dim_labels=b01f_01io->b01f",
+            8000,
+        ),
         # A product of 6 pairs of matrices, as TPUs write it.
         (
             "bf16[6,7,3] bf16[6,5,3] bf16[6,7,5]",
@@ -149,7 +153,9 @@ def test_operations_inside_kernels_of_libraries_are_counted_by_formula() -> None
         f'backend_config={{"gemm_backend_config":{{"dot_dimension_numbers":{numbers}}}}}',
     )
     assert product.flops == 128 and product.bytes == 2 * (32 + 16 + 8)  # without the workspace
-    scores = 'backend_config={"cudnn_fmha_backend_config":{"intermediate_tensor_shape":{"dimensions":["2","4","6","6"]}}}'
+    scores = (
+        'backend_config={"cudnn_fmha_backend_config":{"intermediate_tensor_shape":{"dimensions":["2","4","6","6"]}}}'
+    )
     heads = "bf16[2,6,4,8]{3,2,1,0}"
     forward = call("__cudnn$fmhaSoftmax", f"{heads} {heads} {heads}", f"({heads}, u8[0]{{0}})", scores)
     assert forward.flops == 2 * 2 * (2 * 4 * 6 * 6) * 8
@@ -242,7 +248,10 @@ def test_kernels_that_run_beside_a_collective_hide_it() -> None:
 @pytest.mark.parametrize(
     ("op_name", "part"),
     [
-        ("jit(train_step)/jvp(Transformer)/while/body/closed_call/blocks/rgb/fc1/dot_general", "forward blocks/rgb/fc1"),
+        (
+            "jit(train_step)/jvp(Transformer)/while/body/closed_call/blocks/rgb/fc1/dot_general",
+            "forward blocks/rgb/fc1",
+        ),
         (
             "jit(train_step)/transpose(jvp(Transformer))/while/body/closed_call/checkpoint/rematted_computation/blocks/rgb/"
             "spatial_attn.spatial/vmap(BTNH,BSNH->BNTS)/dot_general",
