@@ -1,6 +1,8 @@
-"""Divides kernels, which compilers cannot look into, among devices by clips.
+"""Keeps a program that is sharded over clips divided by clips.
 
-Without this, a program that is sharded over clips gathers a kernel's operands on every device and runs it there whole.
+Compilers cannot look into kernels: without :func:`each_own_clips` they gather a kernel's operands on every device, and
+run it there whole. And where a mesh splits the parameters, they would split activations in the same way and exchange
+those in each layer, which are far larger; with :func:`gathered` each device gathers the parameters instead.
 """
 
 from collections.abc import Callable
@@ -8,9 +10,24 @@ from functools import partial
 from math import prod
 from typing import Any
 
+import flax.linen as nn
 import jax
 from jax.experimental.custom_partitioning import custom_partitioning
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
+
+FSDP = "fsdp"  # the axis of a mesh that splits the parameters
+
+
+def gathered(params: Any) -> Any:
+    """Returns parameters that are whole on every device, while they are used; without a mesh, as they are."""
+    if FSDP not in jax.sharding.get_abstract_mesh().axis_names:
+        return params
+    return jax.tree.map(lambda x: jax.lax.with_sharding_constraint(x, PartitionSpec()), params)
+
+
+def gathers(block: type[nn.Module]) -> Any:
+    """Returns a class of blocks each of which gathers its parameters when it runs; those of other blocks stay split."""
+    return nn.map_variables(block, "params", trans_in_fn=gathered, init=True)
 
 
 def each_own_clips(run: Callable[..., Any], settings: int, shared: int = 0) -> Callable[..., Any]:

@@ -20,6 +20,7 @@ from jax.typing import ArrayLike
 from jaxtyping import PyTree
 
 from rsjax.config import ConfigError, LoopConfig, require
+from rsjax.layers.partition import FSDP
 from rsjax.trainable import Extra, Params, Trainable
 from rsjax.training.state import TrainState, create_state
 from rsjax.training.step import Metrics
@@ -28,7 +29,6 @@ Tree = TypeVar("Tree")  # a tree of arrays
 
 AXIS = "devices"  # of pmap
 DATA = "data"  # axes of the mesh
-FSDP = "fsdp"
 SMALL = 2**14  # arrays of fewer elements stay whole, since gathering them costs more than their memory
 
 Kind = Literal["jit", "pmap", "mesh"]
@@ -148,7 +148,12 @@ class Sharding:
             )
         places = self._shardings(_shapes(model, loop))
         whole = NamedSharding(self.mesh, P())
-        return jax.jit(step, donate_argnums=0, in_shardings=(places, self._rows), out_shardings=(places, whole))
+
+        def in_mesh(state: TrainState, batch: PyTree) -> tuple[TrainState, Metrics]:
+            with jax.sharding.use_abstract_mesh(self.mesh.abstract_mesh):
+                return step(state, batch)
+
+        return jax.jit(in_mesh, donate_argnums=0, in_shardings=(places, self._rows), out_shardings=(places, whole))
 
     def put_batch(self, batch: PyTree) -> PyTree:
         """Puts this process's part of the global batch on its devices, split along the first axis."""

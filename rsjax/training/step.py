@@ -8,6 +8,7 @@ import optax
 from jaxtyping import Array, Key
 
 from rsjax.config import LoopConfig
+from rsjax.layers.partition import gathered
 from rsjax.trainable import Params, Scalar, StepContext, Term, Trainable
 from rsjax.training.state import TrainState, learning_rate, make_optimizer
 
@@ -83,6 +84,8 @@ def loss_share(
     Args:
         weights: the terms' weights over the whole batch, if ``batch`` is a part of it.
     """
+    # Blocks gather their own parameters (rsjax.layers.partition), one after another.
+    params = {name: part if name == "blocks" else gathered(part) for name, part in params.items()}
     terms = model.loss_terms(params, batch, key, context)
     if weights is not None:
         terms = {name: (value, weights[name]) for name, (value, _) in terms.items()}

@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 from rsjax.layers.attention import KeyValues, attend, attend_few, frames_held, packed, put_frames, unpacked
 from rsjax.layers.dense import PRODUCT, Dense, layer_norm
 from rsjax.layers.gelu import gelu
+from rsjax.layers.partition import gathers
 from rsjax.layers.platform import attend_in_clip
 from rsjax.layers.unstacked_params import together
 from rsjax.models.roboscape.architecture import Architecture
@@ -320,12 +321,13 @@ class Transformer(nn.Module):
 
 
 def _rematerialised(config: Architecture) -> Any:
+    block = gathers(DualBlock)
     if config.remat == "none":
-        return DualBlock
+        return block
     keep = None if config.remat == "blocks" else jax.checkpoint_policies.save_only_these_names(PRODUCT)
     # Common-subexpression elimination could undo the recomputation within an iteration of the scan, not across
     # iterations.
-    return nn.remat(DualBlock, prevent_cse=config.unroll > 1, policy=keep)
+    return nn.remat(block, prevent_cse=config.unroll > 1, policy=keep)
 
 
 def empty_cache(config: Architecture, batch: int, frames: int, dtype: Any = jnp.float32) -> StackedCache:
