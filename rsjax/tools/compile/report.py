@@ -56,7 +56,8 @@ def compile_program(program: Program, target: Target, console: Console) -> Compi
 
     Raises:
         TooLargeError: the compiler finds that it needs more memory than the card has.
-        UserError: the compiler refuses it; the message is its first line and names a file with the rest.
+        UserError: the compiler refuses it; the message is its first line and names a file with the rest. Or the program
+            compiles, but its text cannot be had.
     """
     began = time.monotonic()
     with (
@@ -70,7 +71,14 @@ def compile_program(program: Program, target: Target, console: Console) -> Compi
     memory = compiled.memory_analysis()
     kept = memory.argument_size_in_bytes + memory.output_size_in_bytes - memory.alias_size_in_bytes
     temporaries = memory.temp_size_in_bytes
-    return Compiled(compiled.as_text(), kept + temporaries, temporaries, time.monotonic() - began)
+    try:
+        text = compiled.as_text()
+    except JaxRuntimeError as error:  # a fault of XLA with collectives that are fused with kernels on a TPU
+        raise UserError(
+            f"{program.title} compiles for {target.name} and needs {_bytes(kept + temporaries)} of {_bytes(capacity(target))} "
+            f"a device, but XLA cannot write the program down, so its cost is not known ({first_line(error)})"
+        ) from error
+    return Compiled(text, kept + temporaries, temporaries, time.monotonic() - began)
 
 
 @contextmanager
