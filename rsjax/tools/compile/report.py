@@ -74,9 +74,10 @@ def compile_program(program: Program, target: Target, console: Console) -> Compi
     try:
         text = compiled.as_text()
     except JaxRuntimeError as error:  # a fault of XLA with collectives that are fused with kernels on a TPU
+        size = f"{_bytes(kept + temporaries)} of {_bytes(capacity(target))} a device"
         raise UserError(
-            f"{program.title} compiles for {target.name} and needs {_bytes(kept + temporaries)} of {_bytes(capacity(target))} "
-            f"a device, but XLA cannot write the program down, so its cost is not known ({first_line(error)})"
+            f"{program.title} compiles for {target.name} and needs {size}, but XLA cannot write the program down, so "
+            f"its cost is not known ({first_line(error)})"
         ) from error
     return Compiled(text, kept + temporaries, temporaries, time.monotonic() - began)
 

@@ -81,7 +81,14 @@ def find(name: str) -> Target:
         if card.platform == "tpu":
             return _slice(name, family, parts[1])
         return _gpus(name, family, int(parts[1] or 1))
-    raise ConfigError(f"target {name!r} is not known{did_you_mean(name, _examples())}; targets: {_listed()}")
+    gpus = [name for name, card in CARDS.items() if card.platform == "cuda"]
+    slices = [f"{family}-{size}" for family, sizes in SLICES.items() for size in sizes]
+    near = did_you_mean(name, [*CARDS, *(f"{gpu}x{size}" for gpu in gpus for size in (2, 4, 8, 16, 64)), *slices])
+    named = [
+        *(f"{gpu}, {gpu}xN" for gpu in gpus),
+        *(f"{tpu}-{min(each)} to -{max(each)}" for tpu, each in SLICES.items()),
+    ]
+    raise ConfigError(f"target {name!r} is not known{near}; targets: {', '.join(named)}")
 
 
 def _gpus(name: str, family: str, devices: int) -> Target:
@@ -109,17 +116,6 @@ def _slice(name: str, family: str, number: str | None) -> Target:
     if slices is _FLAT and chips == 8:
         local = 8  # one host of 8 chips
     return Target(name, CARDS[family], chips // local, local, shape)
-
-
-def _examples() -> list[str]:
-    gpus = [f"{name}x{size}" for name, card in CARDS.items() if card.platform == "cuda" for size in (2, 4, 8, 16, 64)]
-    return [*CARDS, *gpus, *(f"{name}-{size}" for name, slices in SLICES.items() for size in slices)]
-
-
-def _listed() -> str:
-    gpus = [f"{name}, {name}xN" for name, card in CARDS.items() if card.platform == "cuda"]
-    tpus = [f"{name}-{min(slices)} to -{max(slices)}" for name, slices in SLICES.items()]
-    return ", ".join([*gpus, *tpus])
 
 
 def devices(target: Target) -> list[Any]:
