@@ -17,6 +17,8 @@ from jaxtyping import Array, Float
 class GroupNorm(nn.Module):
     """Normalises groups of neighbouring channels to mean 0 and variance 1, then scales and shifts each channel.
 
+    It computes in float32; its output has the number format of its input.
+
     The variance is E[(x - E[x])²]: E[x²] - E[x]² is too inexact for parity with public weights.
 
     Attributes:
@@ -32,11 +34,12 @@ class GroupNorm(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[Array, "B *cells C"]) -> Float[Array, "B *cells C"]:
-        x = _normed(x, self._of_cells if self.local else self._of_images, self.epsilon)
-        if not self.affine:
-            return x
-        scale = self.param("scale", nn.initializers.ones, x.shape[-1:])
-        return x * scale + self.param("bias", nn.initializers.zeros, x.shape[-1:])
+        mean = self._of_cells if self.local else self._of_images
+        out = _normed(x.astype(jnp.float32), mean, self.epsilon)
+        if self.affine:
+            scale = self.param("scale", nn.initializers.ones, x.shape[-1:])
+            out = out * scale + self.param("bias", nn.initializers.zeros, x.shape[-1:])
+        return out.astype(x.dtype)
 
     def _of_cells(self, x: Array) -> Array:
         """Returns each cell's mean of each group, at every channel of the group."""

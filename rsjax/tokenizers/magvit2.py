@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, UInt8
 
 from rsjax.config import TokenizerConfig
-from rsjax.layers.convolution import Dtype, conv
+from rsjax.layers.convolution import Conv, Dtype, conv
 from rsjax.layers.group_norm import GroupNorm
 from rsjax.tokenizers import lfq
 
@@ -36,7 +36,7 @@ def depth_to_space(x: Float[Array, "B h w C2"], factor: int) -> Float[Array, "B 
     return x.transpose(0, 1, 3, 2, 4, 5).reshape(b, height * factor, width * factor, c // factor**2)
 
 
-def _conv3(features: int, name: str, dtype: Dtype, bias: bool = False, stride: int = 1) -> nn.Conv:
+def _conv3(features: int, name: str, dtype: Dtype, bias: bool = False, stride: int = 1) -> Conv:
     # Symmetric padding even with stride 2, where 'SAME' would pad one side only.
     return conv(features, 3, dtype, name, stride, padding=((1, 1), (1, 1)), use_bias=bias)
 
@@ -63,7 +63,7 @@ class MagvitResBlock(nn.Module):
         return x + h
 
 
-def _inner_conv(features: int, name: str, dtype: Dtype, local: bool) -> nn.Conv:
+def _inner_conv(features: int, name: str, dtype: Dtype, local: bool) -> Conv:
     if local:
         return conv(features, 1, dtype, name, use_bias=False)
     return _conv3(features, name, dtype)
@@ -80,7 +80,8 @@ class AdaptiveGroupNorm(nn.Module):
         deviation = jnp.sqrt(jnp.var(codes, axis=(1, 2), ddof=1) + 1e-6)
         scale = nn.Dense(x.shape[-1], name="gamma")(deviation)
         shift = nn.Dense(x.shape[-1], name="beta")(jnp.mean(codes, axis=(1, 2)))
-        return scale[:, None, None] * GroupNorm(self.groups, affine=False, name="norm")(x) + shift[:, None, None]
+        normed = GroupNorm(self.groups, affine=False, name="norm")(x)
+        return (scale[:, None, None] * normed + shift[:, None, None]).astype(x.dtype)
 
 
 class MagvitEncoder(nn.Module):
@@ -93,7 +94,7 @@ class MagvitEncoder(nn.Module):
         cfg = self.config
         local = cfg.local_codes
         dtype = cfg.compute_dtype
-        x = space_to_depth(images, cfg.patch_size)
+        x = space_to_depth(images, cfg.patch_size).astype(cfg.feature_dtype)
         x = _inner_conv(cfg.channels, "conv_in", dtype, local)(x)
         levels = len(cfg.channel_multipliers)
         for level, multiplier in enumerate(cfg.channel_multipliers):
@@ -109,7 +110,7 @@ class MagvitEncoder(nn.Module):
         for i in range(cfg.res_blocks):
             x = MagvitResBlock(x.shape[-1], cfg.norm_groups, dtype, local, name=f"mid_block_{i}")(x)
         x = nn.swish(GroupNorm(cfg.norm_groups, local=local, name="norm_out")(x))
-        return conv(cfg.code_bits, 1, dtype, "conv_out")(x)
+        return conv(cfg.code_bits, 1, dtype, "conv_out")(x).astype(jnp.float32)
 
 
 class MagvitDecoder(nn.Module):
@@ -121,7 +122,8 @@ class MagvitDecoder(nn.Module):
     def __call__(self, codes: Float[Array, "B h w D"]) -> Float[Array, "B H W 3"]:
         cfg = self.config
         dtype = self.config.compute_dtype
-        x = _conv3(cfg.channels * cfg.channel_multipliers[-1], "conv_in", dtype, bias=True)(codes)
+        x = codes.astype(cfg.feature_dtype)
+        x = _conv3(cfg.channels * cfg.channel_multipliers[-1], "conv_in", dtype, bias=True)(x)
         for i in range(cfg.res_blocks):
             x = MagvitResBlock(x.shape[-1], cfg.norm_groups, dtype, name=f"mid_block_{i}")(x)
         for level in reversed(range(len(cfg.channel_multipliers))):
@@ -134,7 +136,7 @@ class MagvitDecoder(nn.Module):
                 x = depth_to_space(_conv3(4 * x.shape[-1], f"up_{level}_upsample", dtype, bias=True)(x), 2)
         x = nn.swish(GroupNorm(cfg.norm_groups, name="norm_out")(x))
         x = _conv3(3 * cfg.patch_size**2, "conv_out", dtype, bias=True)(x)
-        return depth_to_space(x, cfg.patch_size)
+        return depth_to_space(x.astype(jnp.float32), cfg.patch_size)
 
 
 class Tokenizer(nn.Module):

@@ -30,7 +30,7 @@ def convolve(x: Float[Array, "B h w C"], kernel: Float[Array, "i j C D"], **sett
         return jax.lax.conv_general_dilated(x, kernel.astype(x.dtype), **settings)
     if len(kernel) == 1:
         return matmul_bf16(x.reshape(-1, x.shape[-1]), kernel[0, 0]).reshape(*x.shape[:-1], -1)
-    return conv_bf16(x, kernel)
+    return conv_bf16(x.astype(jnp.float32), kernel.astype(jnp.float32)).astype(x.dtype)
 
 
 def convolve_video(

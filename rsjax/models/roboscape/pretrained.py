@@ -25,6 +25,7 @@ ALIKE = {"read_previous", "whole_frames", "rotary", "more_norms"}
 # Fields that may differ.
 FREE = {"use_depth", "action_encoder", "action_inputs", "departures"} | {
     "compute_dtype",
+    "feature_dtype",
     *(field.name for field in fields(TransformerConfig) if field.metadata.get("runtime")),
 }
 
