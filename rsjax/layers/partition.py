@@ -12,6 +12,7 @@ from typing import Any
 
 import flax.linen as nn
 import jax
+import jax.numpy as jnp
 from jax.experimental.custom_partitioning import custom_partitioning
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
@@ -59,7 +60,35 @@ def each_own_clips(run: Callable[..., Any], settings: int, shared: int = 0) -> C
         specs = (spec,) * (len(arrays) - shared) + (PartitionSpec(),) * shared
         return jax.shard_map(own, in_specs=specs, out_specs=spec, axis_names=set(axes), check_vma=False)(*arrays)
 
-    return divided
+    return _folding(divided, settings, shared)
+
+
+def _folding(run: Callable[..., Any], settings: int, shared: int) -> Callable[..., Any]:
+    """Returns a function that ``vmap`` runs once, with its axis folded into that over clips."""
+
+    def folding(*arguments: Any) -> Any:
+        values = arguments[:settings]
+        arrays = arguments[settings:]
+
+        @jax.custom_batching.custom_vmap
+        def call(*arrays: Any) -> Any:
+            return run(*values, *arrays)
+
+        @call.def_vmap
+        def batched(size: int, are_batched: Any, *arrays: Any) -> tuple[Any, Any]:
+            of_clips = len(arrays) - shared
+            if any(are_batched[of_clips:]):
+                raise NotImplementedError("parameters of a kernel cannot be mapped over; map over clips alone")
+            folded = [
+                (x if is_batched else jnp.broadcast_to(x, (size, *x.shape))).reshape(-1, *x.shape[is_batched + 1 :])
+                for x, is_batched in zip(arrays[:of_clips], are_batched, strict=False)
+            ]
+            out = call(*folded, *arrays[of_clips:])
+            return jax.tree.map(lambda x: x.reshape(size, -1, *x.shape[1:]), out), jax.tree.map(lambda _: True, out)
+
+        return call(*arrays)
+
+    return folding
 
 
 def _as_sharded(run: Callable[..., Any], settings: int, shared: int) -> Callable[..., Any]:

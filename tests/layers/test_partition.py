@@ -2,7 +2,13 @@ import json
 import os
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
+
+import jax
+import numpy as np
+
+from rsjax.layers.gpu.attention import attend
 
 ROOT = Path(__file__).parents[2]
 
@@ -20,3 +26,15 @@ def test_every_device_runs_a_kernel_with_its_own_clips() -> None:
     assert figures["gathers"] == 0
     assert figures["sharded"]
     assert max(figures["mesh"], figures["set mesh"], figures["pmap"]) < 1e-5, figures
+
+
+def test_a_kernel_that_is_mapped_over_gives_what_it_gives_alone() -> None:
+    qkv = jax.random.normal(jax.random.key(0), (3, 2, 2, 16, 3, 1, 16))
+    run = partial(attend, over="cells", interpret=True)
+
+    def squares(qkv: jax.Array) -> jax.Array:
+        return (run(qkv) ** 2).sum()
+
+    for function in (run, jax.grad(squares)):
+        alone = [function(each) for each in qkv]
+        np.testing.assert_allclose(jax.vmap(function)(qkv), alone, atol=1e-6)
