@@ -28,6 +28,13 @@ def by_platform(cpu: Callable[..., Any], accelerator: Callable[..., Any], *opera
     return jax.lax.platform_dependent(*operands, cpu=cpu, default=accelerator)
 
 
+def in_feature_dtype(dtype: str, run: Callable[[str], Any]) -> Any:
+    """Returns ``run(dtype)``; in a program for a CPU ``run("float32")``, since features in bf16 are slower there."""
+    if dtype == "float32":
+        return run(dtype)
+    return by_platform(partial(run, "float32"), partial(run, dtype))
+
+
 def attend_in_clip(
     qkv: Float[Array, "B T S 3 h e"], over: Literal["cells", "frames"], bf16: bool
 ) -> Float[Array, "B T S h e"]:

@@ -19,7 +19,7 @@ from rsjax.data.normalization import Normalization
 from rsjax.devices import divide, map_rows, mesh_of, on_cpu
 from rsjax.errors import UserError
 from rsjax.layers.platform import by_platform
-from rsjax.tokenizers.magvit2 import Tokenizer
+from rsjax.tokenizers.magvit2 import run_tokenizer
 from rsjax.trainable import Params
 
 Tokens = dict[str, Int[np.ndarray, "B T h w"]]
@@ -158,7 +158,7 @@ def _run(config: TokenizerConfig, method: str, mesh: Mesh | None, params: Params
     """Encodes or decodes images: on a CPU one by one, so that an image's features stay in the processor's cache."""
 
     def run(params: Params, images: ArrayLike) -> jax.Array:
-        return cast(jax.Array, Tokenizer(config).apply({"params": params}, images, method=method))
+        return cast(jax.Array, run_tokenizer(config, params, images, method))
 
     def one_by_one(params: Params, images: ArrayLike) -> jax.Array:
         return map_rows(lambda params, image: run(params, image[None])[0], params, images, mesh)

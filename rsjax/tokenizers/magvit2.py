@@ -6,6 +6,7 @@ downsampling pads symmetrically, and there is no attention. Submodules are named
 Axes: B images, H×W pixels, h×w token cells, C channels, D code bits.
 """
 
+from dataclasses import replace
 from typing import Any
 
 import flax.linen as nn
@@ -15,7 +16,9 @@ from jaxtyping import Array, Float, Int, UInt8
 from rsjax.config import TokenizerConfig
 from rsjax.layers.convolution import Conv, Dtype, conv
 from rsjax.layers.group_norm import GroupNorm
+from rsjax.layers.platform import in_feature_dtype
 from rsjax.tokenizers import lfq
+from rsjax.trainable import Params
 
 
 def space_to_depth(x: Float[Array, "B H W C"], factor: int) -> Float[Array, "B h w C2"]:
@@ -167,6 +170,15 @@ class Tokenizer(nn.Module):
         """Returns fresh parameters, which do not depend on the image size."""
         size = 2 * self.config.downsampling
         return self.init(key, jnp.zeros((1, size, size, 3)))["params"]
+
+
+def run_tokenizer(config: TokenizerConfig, params: Params, inputs: Any, method: str | None = None) -> Any:
+    """Returns what :class:`Tokenizer` returns, with ``config.feature_dtype`` where that is faster."""
+
+    def run(dtype: Any) -> Any:
+        return Tokenizer(replace(config, feature_dtype=dtype)).apply({"params": params}, inputs, method=method)
+
+    return in_feature_dtype(config.feature_dtype, run)
 
 
 def to_unit(pixels: Any) -> Float[Array, "*batch"]:

@@ -27,7 +27,7 @@ from rsjax.tokenizers.codec import Codec
 from rsjax.tokenizers.discriminator import MIN_SIZE, Discriminator
 from rsjax.tokenizers.flops import tokenizer_flops
 from rsjax.tokenizers.lpips import load_lpips, lpips, min_size
-from rsjax.tokenizers.magvit2 import Tokenizer, to_unit
+from rsjax.tokenizers.magvit2 import Tokenizer, run_tokenizer, to_unit
 from rsjax.trainable import Extra, Params, Scalar, StepContext, Term
 
 Images: TypeAlias = Float[Array, "B H W 3"]
@@ -95,8 +95,7 @@ class TokenizerTraining(Autoencoder[Images]):
         train = self.train
         extra = cast(dict[str, Any], context.extra)
         target = to_unit(batch)
-        variables = {"params": self.tokenizer_params(params)}
-        output, latents = cast(tuple[Images, Latents], Tokenizer(self.tokenizer).apply(variables, target))
+        output, latents = run_tokenizer(self.tokenizer, self.tokenizer_params(params), target)
         count = jnp.float32(batch.shape[0])
         error = (target - output).astype(jnp.float32)
         means = {

@@ -28,7 +28,7 @@ from rsjax.models.roboscape.departures import mean_codes
 from rsjax.models.roboscape.sample import State, start, step
 from rsjax.models.roboscape.transformer import Cache
 from rsjax.tokenizers.codec import Codec
-from rsjax.tokenizers.magvit2 import Tokenizer
+from rsjax.tokenizers.magvit2 import run_tokenizer
 from rsjax.trainable import Params
 
 
@@ -222,7 +222,7 @@ def _advance(
     )
     stacked, frame = step(arch, sample, params, stacked, actions[:, None])
     grid = frame["rgb"].reshape(len(states), arch.grid, arch.grid, *frame["rgb"].shape[3:])
-    pixels: Any = Tokenizer(tokenizer).apply({"params": tokenizer_params}, grid, method="decode")
+    pixels: Any = run_tokenizer(tokenizer, tokenizer_params, grid, "decode")
     kept = replace(stacked, cache={}, key=None, temperature=None, guidance=None)
     numbers = range(len(states))
     parts = tuple(jax.tree.map(lambda x, i=i: x[i], kept) for i in numbers)

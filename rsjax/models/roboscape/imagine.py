@@ -18,7 +18,7 @@ from rsjax.data.normalization import Normalization, with_sums
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.sample import CLIPS, State, start, step, where
 from rsjax.tokenizers.codec import Codec
-from rsjax.tokenizers.magvit2 import Tokenizer
+from rsjax.tokenizers.magvit2 import run_tokenizer
 from rsjax.trainable import Params
 
 
@@ -121,7 +121,7 @@ def _step(
 
     def pixels(branch: str) -> Array:
         grid = frame[branch].reshape(len(actions), arch.grid, arch.grid, *frame[branch].shape[3:])
-        return cast(Array, Tokenizer(tokenizer).apply({"params": tokenizer_params}, grid, method="decode"))
+        return cast(Array, run_tokenizer(tokenizer, tokenizer_params, grid, "decode"))
 
     rgb = jnp.round(pixels("rgb")).astype(jnp.uint8)
     if normalization is None or normalization.depth_range is None:

@@ -32,7 +32,7 @@ from rsjax.models.roboscape.imagine import TokenImagination
 from rsjax.models.roboscape.objective import Batch
 from rsjax.models.roboscape.sample import Tokens, encode_prompt, rollout, rollout_from
 from rsjax.models.roboscape.teacher_forcing import score_tokens
-from rsjax.models.roboscape.transformer import Transformer, empty_cache
+from rsjax.models.roboscape.transformer import Transformer, empty_cache, run_transformer
 from rsjax.tokenizers.codec import Codec
 from rsjax.tokenizers.tokenize import tokenize_store
 from rsjax.trainable import Params, StepContext, Term
@@ -90,15 +90,15 @@ class RoboScape(WorldModel[Batch]):
         mask = hidden(departures, corrupted.mask)
         no_depth = None if batch.has_depth is None else batch.has_depth == 0
         drop = dropped_actions(departures.action_dropout, key, batch.index)
-        network = partial(Transformer(arch).apply, drop_actions=drop, no_depth=no_depth)
+        network = partial(run_transformer, arch, drop_actions=drop, no_depth=no_depth)
         inputs = (corrupted.tokens, mask, batch.actions)
         previous = None
         if departures.self_conditioning:
-            fixed = {"params": jax.lax.stop_gradient(params)}
+            fixed = jax.lax.stop_gradient(params)
             on = conditions_itself(departures, key, context.step)
             first_pass = partial(network, fixed, *inputs)
             previous = previous_frames(first_pass, corrupted.tokens, arch.code_bits, on, self.prompt_frames)
-        logits, _ = network({"params": params}, *inputs, previous=previous)
+        logits, _ = network(params, *inputs, previous=previous)
         terms = objective.loss_terms(self.config, arch, logits, targets, mask, batch)
         return jax.tree.map(lambda x: x.astype("float32"), terms)
 

@@ -30,7 +30,7 @@ from rsjax.layers.unstacked_params import apart, together
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.departures import guidance, mean_codes
 from rsjax.models.roboscape.maskgit import Frame, unmask_step
-from rsjax.models.roboscape.transformer import Cache, Cells, StackedCache, Transformer, empty_cache
+from rsjax.models.roboscape.transformer import Cache, Cells, StackedCache, empty_cache, run_transformer
 from rsjax.trainable import Params
 
 Tokens = dict[str, Int[Array, "B T H W"]]
@@ -258,8 +258,8 @@ def apply_network(
     shape = (*mask.shape[:2], arch.grid, arch.grid)
     grids = {branch: cells.reshape(*shape, *cells.shape[3:]) for branch, cells in tokens.items()}
     whole = params | {"blocks": together(params["blocks"])}
-    logits, cache = Transformer(arch).apply(
-        {"params": whole}, grids, mask.reshape(shape), actions, start, cache, drop, no_depth, previous
+    logits, cache = run_transformer(
+        arch, whole, grids, mask.reshape(shape), actions, start, cache, drop, no_depth, previous
     )
     return guidance.guided(sample, logits, strength), cache
 

@@ -22,7 +22,7 @@ from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.departures.read_previous import frame_before
 from rsjax.models.roboscape.maskgit import sample_tokens
 from rsjax.models.roboscape.sample import cache_slots, window_actions, window_start
-from rsjax.models.roboscape.transformer import Transformer, empty_cache
+from rsjax.models.roboscape.transformer import empty_cache, run_transformer
 from rsjax.tokenizers import lfq
 from rsjax.trainable import Params
 
@@ -78,7 +78,7 @@ def _score_window(
 ) -> tuple[Scores, Scores]:
     """Returns cross-entropy and accuracy of each frame's tokens by branch; frame 0 is predicted from none."""
     clips, frames = actions.shape[:2]
-    transformer = partial(Transformer(arch).apply, {"params": params}, no_depth=no_depth if arch.use_depth else None)
+    transformer = partial(run_transformer, arch, params, no_depth=no_depth if arch.use_depth else None)
     visible = jnp.zeros((clips, frames, arch.grid, arch.grid), bool)
     empty = empty_cache(arch, clips, cache_slots(arch, frames + arch.uncommitted))
     _, cache = transformer(tokens, visible, actions, 0, empty)

@@ -7,6 +7,7 @@ Axes: B clips, T frames, H×W = S token cells, A action dimensions, n vocabulari
 e = C/h, q queries, k keys.
 """
 
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -19,7 +20,7 @@ from rsjax.layers.attention import KeyValues, attend, attend_few, frames_held, p
 from rsjax.layers.dense import PRODUCT, Dense, layer_norm
 from rsjax.layers.gelu import gelu
 from rsjax.layers.partition import gathers
-from rsjax.layers.platform import attend_in_clip
+from rsjax.layers.platform import attend_in_clip, in_feature_dtype
 from rsjax.layers.unstacked_params import together
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.departures.action_dropout import with_null_action
@@ -318,6 +319,15 @@ class Transformer(nn.Module):
         tokens = jnp.zeros((1, 1, cfg.grid, cfg.grid), jnp.int32)
         actions = jnp.zeros((1, 1, cfg.action_inputs))
         return self.init(key, dict.fromkeys(cfg.branches, tokens), tokens == 0, actions)["params"]
+
+
+def run_transformer(arch: Architecture, params: Params, *inputs: Any, **options: Any) -> Any:
+    """Returns what :class:`Transformer` returns for these inputs, with ``arch.feature_dtype`` where that is faster."""
+
+    def run(dtype: Any) -> Any:
+        return Transformer(replace(arch, feature_dtype=dtype)).apply({"params": params}, *inputs, **options)
+
+    return in_feature_dtype(arch.feature_dtype, run)
 
 
 def _rematerialised(config: Architecture) -> Any:

@@ -18,7 +18,7 @@ from rsjax.models.roboscape.departures import guidance
 from rsjax.models.roboscape.model import RoboScape
 from rsjax.models.roboscape.sample import for_many_passes, start, step
 from rsjax.tokenizers.codec import PIXELS
-from rsjax.tokenizers.magvit2 import Tokenizer
+from rsjax.tokenizers.magvit2 import run_tokenizer
 from rsjax.tools.bench import inputs
 from rsjax.trainable import Trainable
 from rsjax.training.sharding import Sharding
@@ -197,7 +197,6 @@ def encode(config: Config, device: Any) -> Program:
     """Returns the program that encodes images, in passes as before the world model's training."""
     size = config.clips.image_size
     images = max(1, PIXELS // size**2)
-    tokenizer = Tokenizer(config.tokenizer)
     place = SingleDeviceSharding(device)
     params = create_autoencoder(config).shapes()
     arguments = jax.tree.map(
@@ -206,7 +205,7 @@ def encode(config: Config, device: Any) -> Program:
     )
 
     def run(params: Any, images: Any) -> Any:
-        return tokenizer.apply({"params": params}, images, method="encode")
+        return run_tokenizer(config.tokenizer, params, images, "encode")
 
     return Program(
         title=f"encoding {images} images",

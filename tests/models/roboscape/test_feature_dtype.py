@@ -1,0 +1,48 @@
+"""Features in bf16 between layers: close to float32, used on accelerators alone."""
+
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rsjax.models.roboscape.transformer import Transformer, run_transformer
+from tests.models.roboscape.toy import DUAL, random_inputs, random_params
+
+WIDE = replace(DUAL, width=32, compute_dtype="bfloat16")
+NARROW = replace(WIDE, feature_dtype="bfloat16")
+
+
+def test_logits_and_gradients_are_those_of_float32_to_rounding() -> None:
+    params = random_params(WIDE)
+    arguments = random_inputs(WIDE)
+
+    def loss(arch: Any, params: Any) -> Any:
+        logits, _ = Transformer(arch).apply({"params": params}, *arguments)
+        return sum(jnp.mean(jnp.square(x)) for x in logits.values())
+
+    values = [jax.jit(jax.value_and_grad(partial(loss, arch)))(params) for arch in (WIDE, NARROW)]
+    (expected, gradients), (found, other_gradients) = values
+    np.testing.assert_allclose(found, expected, rtol=0.05)
+    assert found != expected
+    for x, y in zip(jax.tree.leaves(other_gradients), jax.tree.leaves(gradients), strict=True):
+        assert x.dtype == jnp.float32
+        np.testing.assert_allclose(x, y, atol=0.1 * float(jnp.max(jnp.abs(y))) + 1e-6)
+
+
+def test_a_program_for_a_cpu_keeps_features_in_float32() -> None:
+    params = random_params(WIDE)
+    arguments = random_inputs(WIDE)
+    expected = Transformer(WIDE).apply({"params": params}, *arguments)[0]
+    found = run_transformer(NARROW, params, *arguments)[0]
+    jax.tree.map(np.testing.assert_array_equal, found, expected)
+
+
+def test_a_program_for_a_gpu_has_features_in_bf16() -> None:
+    run = jax.jit(partial(run_transformer, NARROW)).trace(random_params(WIDE), *random_inputs(WIDE))
+    clips, frames = random_inputs(WIDE)[1].shape[:2]
+    features = f"tensor<{clips}x{frames}x{WIDE.grid**2}x{WIDE.width}xbf16>"
+    assert features in run.lower(lowering_platforms=("cuda",)).as_text()
+    assert features not in run.lower(lowering_platforms=("cpu",)).as_text()
