@@ -13,6 +13,7 @@ from rsjax.layers.platform import linear
 Params: TypeAlias = dict[str, Any]  # a tree of arrays
 
 TORCH_KERNEL = nn.initializers.variance_scaling(1 / 3, "fan_in", "uniform")
+EPSILON = 1e-5  # of LayerNorm, as in torch
 PRODUCT = "product"  # the name of linear layers' outputs in rematerialisation policies
 
 
@@ -27,15 +28,33 @@ class Dense(nn.Module):
     use_bias: bool = True
     kernel_init: nn.initializers.Initializer = TORCH_KERNEL
 
-    @nn.compact
     def __call__(self, x: Float[Array, "*N K"]) -> Float[Array, "*N M"]:
-        kernel = self.param("kernel", self.kernel_init, (x.shape[-1], self.features))
-        bias = self.param("bias", nn.initializers.zeros, (self.features,)) if self.use_bias else None
-        if self.bf16:
-            out = linear(x.reshape(-1, x.shape[-1]), kernel, bias).reshape(*x.shape[:-1], self.features)
-        else:
-            out = x @ kernel if bias is None else x @ kernel + bias
-        return checkpoint_name(out, PRODUCT)
+        return dense(x, *self.parameters(x.shape[-1]), self.bf16)
+
+    @nn.compact
+    def parameters(self, inputs: int) -> tuple[Float[Array, "K M"], Any]:
+        """Returns kernel and bias, which may be None, for a function that does more than this layer."""
+        kernel = self.param("kernel", self.kernel_init, (inputs, self.features))
+        return kernel, self.param("bias", nn.initializers.zeros, (self.features,)) if self.use_bias else None
+
+
+class NormParameters(nn.Module):
+    """Scale and bias of a LayerNorm, for a function that does more than the norm."""
+
+    @nn.compact
+    def __call__(self, width: int) -> tuple[Float[Array, " C"], Float[Array, " C"]]:
+        return self.param("scale", nn.initializers.ones, (width,)), self.param("bias", nn.initializers.zeros, (width,))
+
+
+def dense(
+    x: Float[Array, "*N K"], kernel: Float[Array, "K M"], bias: Float[Array, " M"] | None, bf16: bool
+) -> Float[Array, "*N M"]:
+    """Returns the output of :class:`Dense` with these parameters."""
+    if bf16:
+        out = linear(x.reshape(-1, x.shape[-1]), kernel, bias).reshape(*x.shape[:-1], kernel.shape[1])
+    else:
+        out = x @ kernel if bias is None else x @ kernel + bias
+    return checkpoint_name(out, PRODUCT)
 
 
 def rounded(params: Params) -> Params:
@@ -48,5 +67,5 @@ def rounded(params: Params) -> Params:
 
 
 def layer_norm(name: str | None, dtype: Any = jnp.float32) -> nn.LayerNorm:
-    """Returns a LayerNorm with torch's epsilon and float32 statistics, whose output has this number format."""
-    return nn.LayerNorm(epsilon=1e-5, dtype=dtype, name=name)
+    """Returns a LayerNorm with float32 statistics, whose output has this number format."""
+    return nn.LayerNorm(epsilon=EPSILON, dtype=dtype, name=name)

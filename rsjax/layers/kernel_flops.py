@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from math import prod
 
 from rsjax.layers import packed_attention
+from rsjax.layers.gpu import feed_forward, mlp
 
 Shapes = Sequence[tuple[int, ...]]
 
@@ -32,6 +33,10 @@ KERNEL_FLOPS: dict[str, Callable[[Shapes, Shapes], float]] = {
     "attend_cells_backward": lambda operands, results: packed_attention.flops(operands[0], "cells")[1],
     "attend_frames_forward": lambda operands, results: packed_attention.flops(operands[0], "frames")[0],
     "attend_frames_backward": lambda operands, results: packed_attention.flops(operands[0], "frames")[1],
+    "mlp_forward": lambda operands, results: mlp.flops(operands[0][0], *operands[1]),
+    "mlp_backward": lambda operands, results: mlp.flops(operands[0][0], *operands[2]),
+    "feed_forward_forward": lambda operands, results: feed_forward.flops(operands[0][0], *operands[1]),
+    "feed_forward_backward": lambda operands, results: feed_forward.flops(operands[0][0], *operands[2]),
     "add_norm_forward": lambda operands, results: 0,  # no products
     "add_norm_backward": lambda operands, results: 0,
 }

@@ -20,6 +20,8 @@ from rsjax.layers.attention import attend, unpacked
 from rsjax.layers.cpu import convolution, frame_attention
 from rsjax.layers.cpu import matmul as cpu_matmul
 from rsjax.layers.gpu import attention as gpu
+from rsjax.layers.gpu import feed_forward as gpu_feed_forward
+from rsjax.layers.gpu import mlp as gpu_mlp
 from rsjax.layers.tpu import attention as tpu
 
 
@@ -58,6 +60,37 @@ def attend_in_clip(
     if qkv.dtype == jnp.bfloat16 and tpu.fits(qkv.shape, over):
         kernels["tpu"] = partial(tpu.attend, over=over)
     return jax.lax.platform_dependent(qkv, default=plain, **kernels)
+
+
+def mlp(
+    x: Float[Array, "B T S C"],
+    norm: gpu_mlp.Norm | None,
+    fc1: gpu_mlp.Linear,
+    fc2: gpu_mlp.Linear,
+    layers: Callable[..., Float[Array, "B T S C"]],
+) -> Float[Array, "B T S C"]:
+    """Returns ``layers(x, norm, fc1, fc2)``, x + fc2(gelu(fc1(norm(x)))).
+
+    GPUs do it by one kernel a pass if x is bf16 and fits.
+    """
+    if x.dtype != jnp.bfloat16 or not gpu_mlp.fits(x.shape, fc1[0].shape[1]):
+        return layers(x, norm, fc1, fc2)
+    return jax.lax.platform_dependent(x, norm, fc1, fc2, cuda=gpu_mlp.mlp, default=layers)
+
+
+def feed_forward(
+    x: Float[Array, "B T S C"],
+    fc1: gpu_mlp.Linear,
+    fc2: gpu_mlp.Linear,
+    layers: Callable[..., Float[Array, "B T S C"]],
+) -> Float[Array, "B T S C"]:
+    """Returns ``layers(x, fc1, fc2)``, fc2(gelu(fc1(x))).
+
+    GPUs keep what lies around the GELU on the chip if x is bf16 and fits.
+    """
+    if x.dtype != jnp.bfloat16 or not gpu_feed_forward.fits(x.shape, fc1[0].shape[1]):
+        return layers(x, fc1, fc2)
+    return jax.lax.platform_dependent(x, fc1, fc2, cuda=gpu_feed_forward.feed_forward, default=layers)
 
 
 def linear(

@@ -17,8 +17,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from rsjax.layers.attention import KeyValues, attend, attend_few, frames_held, packed, put_frames, unpacked
-from rsjax.layers.dense import PRODUCT, Dense, layer_norm
+from rsjax.layers.dense import PRODUCT, Dense, NormParameters, layer_norm
 from rsjax.layers.gelu import gelu
+from rsjax.layers.mlp import mlp
 from rsjax.layers.partition import gathers
 from rsjax.layers.platform import attend_in_clip, in_feature_dtype
 from rsjax.layers.unstacked_params import together
@@ -165,9 +166,11 @@ class STBlock(nn.Module):
         normed = optional_norm(cfg.departures.more_norms, "norm_temporal", x)
         out, cache = Attention(cfg, name="temporal_attn").temporal(normed, start, cache)
         x = x + out
-        normed = optional_norm(not cfg.public.qk_norm, "norm2", x)
-        inner = gelu(Dense(cfg.public.mlp_ratio * cfg.width, bf16, name="fc1")(normed))
-        return x + Dense(cfg.width, bf16, name="fc2")(inner), cache
+        norm = None if cfg.public.qk_norm else NormParameters(name="norm2")(cfg.width)
+        inner = cfg.public.mlp_ratio * cfg.width
+        fc1 = Dense(inner, name="fc1").parameters(cfg.width)
+        fc2 = Dense(cfg.width, name="fc2").parameters(inner)
+        return mlp(x, norm, fc1, fc2, bf16), cache
 
 
 class DualBlock(nn.Module):
