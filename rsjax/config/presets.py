@@ -193,7 +193,7 @@ def _full_size(name: str, model: RoboScapeConfig | GenieConfig) -> Config:
     return Config(
         name=name,
         sim=SimConfig(image_size=256),
-        tokenizer=TokenizerConfig(compute_dtype="bfloat16", feature_dtype="bfloat16"),
+        tokenizer=TokenizerConfig(compute_dtype="bfloat16"),
         # Open-MAGVIT2: Adam, 256 images a step, 270 epochs of ImageNet, the rate divided by 10 after 200 and 250 of
         # them. LPIPS needs the path of its weights, --tokenizer-train.perceptual.lpips.
         tokenizer_train=TokenizerTrainConfig(
@@ -212,7 +212,6 @@ def _full_size(name: str, model: RoboScapeConfig | GenieConfig) -> Config:
         model=replace(
             model,
             compute_dtype="bfloat16",
-            feature_dtype="bfloat16",
             remat="blocks",
             sample=SampleConfig(cache_dtype="bfloat16"),
         ),

@@ -199,9 +199,6 @@ class TransformerConfig:
     # more, of attention within frames. Parameters, norms and softmaxes stay float32. CPUs without bf16 units still
     # multiply linear layers in float32, which is faster there.
     compute_dtype: Literal["float32", "bfloat16"] = "float32"
-    # bfloat16: the features between layers too, which halves the traffic with memory; needs compute_dtype bfloat16.
-    # Parameters, norms' statistics, softmaxes and the loss stay float32. Small models train on CPUs with float32.
-    feature_dtype: Literal["float32", "bfloat16"] = "float32"
     unroll: int = runtime(1)  # blocks per iteration of the scan; more are faster on a CPU and compile longer
     # What the backward pass recomputes. none: nothing. blocks: everything but each block's input. products: the same,
     # but linear layers' outputs are kept too (less work, more memory).
@@ -215,10 +212,6 @@ class TransformerConfig:
         require(
             self.width % self.heads == 0,
             f"model.width {self.width} is not divisible by model.heads {self.heads}; change one of them",
-        )
-        require(
-            self.feature_dtype == "float32" or self.compute_dtype == "bfloat16",
-            "model.feature_dtype is bfloat16, but model.compute_dtype float32; set both to bfloat16",
         )
         departures = self.departures
         require(

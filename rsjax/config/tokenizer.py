@@ -35,9 +35,6 @@ class TokenizerConfig:
     # float32, which is faster there. The public code trains in mixed half precision and is used in
     # float32.
     compute_dtype: Literal["float32", "bfloat16"] = "float32"
-    # bfloat16: the features between layers too, which halves the traffic with memory; needs compute_dtype bfloat16.
-    # Parameters, norms, latents and losses stay float32.
-    feature_dtype: Literal["float32", "bfloat16"] = "float32"
 
     def __post_init__(self) -> None:
         sizes = ("patch_size", "channels", "res_blocks", "norm_groups", "code_bits", "vocabularies")

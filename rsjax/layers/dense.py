@@ -58,9 +58,9 @@ def dense(
 
 
 def rounded(params: Params) -> Params:
-    """Rounds linear layers to bf16, as they do themselves in every pass over features in bf16."""
+    """Rounds the kernels of linear layers to bf16, as they do themselves in every pass."""
     if "kernel" in params:
-        return {name: x.astype(jnp.bfloat16) for name, x in params.items()}
+        return params | {"kernel": params["kernel"].astype(jnp.bfloat16)}
     if "scale" in params:
         return params
     return {name: rounded(inner) for name, inner in params.items()}

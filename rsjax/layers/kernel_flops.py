@@ -37,6 +37,4 @@ KERNEL_FLOPS: dict[str, Callable[[Shapes, Shapes], float]] = {
     "mlp_backward": lambda operands, results: mlp.flops(operands[0][0], *operands[2]),
     "feed_forward_forward": lambda operands, results: feed_forward.flops(operands[0][0], *operands[1]),
     "feed_forward_backward": lambda operands, results: feed_forward.flops(operands[0][0], *operands[2]),
-    "add_norm_forward": lambda operands, results: 0,  # no products
-    "add_norm_backward": lambda operands, results: 0,
 }

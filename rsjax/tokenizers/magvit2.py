@@ -6,7 +6,6 @@ downsampling pads symmetrically, and there is no attention. Submodules are named
 Axes: B images, H×W pixels, h×w token cells, C channels, D code bits.
 """
 
-from dataclasses import replace
 from typing import Any
 
 import flax.linen as nn
@@ -91,13 +90,14 @@ class MagvitEncoder(nn.Module):
     """Maps images in [-1, 1] to latents, whose signs are the code."""
 
     config: TokenizerConfig
+    feature_dtype: Dtype = "float32"  # of the features between layers
 
     @nn.compact
     def __call__(self, images: Float[Array, "B H W 3"]) -> Float[Array, "B h w D"]:
         cfg = self.config
         local = cfg.local_codes
         dtype = cfg.compute_dtype
-        x = space_to_depth(images, cfg.patch_size).astype(cfg.feature_dtype)
+        x = space_to_depth(images, cfg.patch_size).astype(self.feature_dtype)
         x = _inner_conv(cfg.channels, "conv_in", dtype, local)(x)
         levels = len(cfg.channel_multipliers)
         for level, multiplier in enumerate(cfg.channel_multipliers):
@@ -120,12 +120,13 @@ class MagvitDecoder(nn.Module):
     """Maps codes in {-1, +1} to images in about [-1, 1] (not clipped)."""
 
     config: TokenizerConfig
+    feature_dtype: Dtype = "float32"
 
     @nn.compact
     def __call__(self, codes: Float[Array, "B h w D"]) -> Float[Array, "B H W 3"]:
         cfg = self.config
         dtype = self.config.compute_dtype
-        x = codes.astype(cfg.feature_dtype)
+        x = codes.astype(self.feature_dtype)
         x = _conv3(cfg.channels * cfg.channel_multipliers[-1], "conv_in", dtype, bias=True)(x)
         for i in range(cfg.res_blocks):
             x = MagvitResBlock(x.shape[-1], cfg.norm_groups, dtype, name=f"mid_block_{i}")(x)
@@ -146,10 +147,11 @@ class Tokenizer(nn.Module):
     """Encoder, lookup-free quantiser and decoder; ``apply`` takes ``method`` "encode", "decode" or neither."""
 
     config: TokenizerConfig
+    feature_dtype: Dtype = "float32"
 
     def setup(self) -> None:
-        self.encoder = MagvitEncoder(self.config)
-        self.decoder = MagvitDecoder(self.config)
+        self.encoder = MagvitEncoder(self.config, self.feature_dtype)
+        self.decoder = MagvitDecoder(self.config, self.feature_dtype)
 
     def __call__(self, images: Float[Array, "B H W 3"]) -> tuple[Float[Array, "B H W 3"], Float[Array, "B h w D"]]:
         """Returns (reconstruction, latents) of images in [-1, 1], differentiable through the quantiser."""
@@ -173,12 +175,12 @@ class Tokenizer(nn.Module):
 
 
 def run_tokenizer(config: TokenizerConfig, params: Params, inputs: Any, method: str | None = None) -> Any:
-    """Returns what :class:`Tokenizer` returns, with ``config.feature_dtype`` where that is faster."""
+    """Returns what :class:`Tokenizer` returns; its features have ``compute_dtype`` where that is faster."""
 
     def run(dtype: Any) -> Any:
-        return Tokenizer(replace(config, feature_dtype=dtype)).apply({"params": params}, inputs, method=method)
+        return Tokenizer(config, dtype).apply({"params": params}, inputs, method=method)
 
-    return in_feature_dtype(config.feature_dtype, run)
+    return in_feature_dtype(config.compute_dtype, run)
 
 
 def to_unit(pixels: Any) -> Float[Array, "*batch"]:

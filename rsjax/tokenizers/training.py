@@ -36,7 +36,7 @@ Latents: TypeAlias = Float[Array, "B h w D"]
 ENTROPY_TEMPERATURE = 0.01  # of the codes' probabilities in the entropy loss, as in the reference
 
 # Fields that may differ between the saved tokenizer and the one to train.
-FREE = {"vocabularies", "depth_scale", "compute_dtype", "feature_dtype"}
+FREE = {"vocabularies", "depth_scale", "compute_dtype"}
 
 
 @dataclass(frozen=True)

@@ -12,13 +12,15 @@ from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array
 
 from rsjax.layers.gpu.attention import attend
-from rsjax.layers.gpu.layer_norm import add_norm
+from rsjax.layers.gpu.mlp import mlp
 
 
 def loss(qkv: Array) -> Array:
     out = attend(qkv, "cells", interpret=True)
-    total, normed = add_norm(out.reshape(len(out), -1, 128), None, jnp.full(128, 2.0), jnp.ones(128), interpret=True)
-    return jnp.sum(total * normed**2)
+    x = out.reshape(*out.shape[:3], -1)
+    fc1 = (jnp.full((128, 64), 0.01), jnp.zeros(64))
+    fc2 = (jnp.full((64, 128), 0.01), jnp.zeros(128))
+    return jnp.sum(mlp(x, (jnp.full(128, 2.0), jnp.ones(128)), fc1, fc2, interpret=True) ** 2)
 
 
 def main() -> None:

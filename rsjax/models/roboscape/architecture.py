@@ -1,6 +1,7 @@
 """The architecture of a transformer: its settings, and sizes that follow from the clips and the tokenizer."""
 
 from dataclasses import dataclass, fields
+from typing import Literal
 
 from rsjax.config import (
     Config,
@@ -23,6 +24,8 @@ class Architecture(TransformerConfig):
         code_bits: bits of a token, in ``vocabularies`` equal parts.
         action_inputs: numbers per frame that the action encoder reads; 0: no encoder.
         use_depth: whether the network has a depth branch.
+        feature_dtype: of the features between layers; :func:`rsjax.models.roboscape.transformer.run_transformer` sets
+            it.
     """
 
     frames: int = 16
@@ -31,6 +34,7 @@ class Architecture(TransformerConfig):
     vocabularies: int = 2
     action_inputs: int = 28
     use_depth: bool = True
+    feature_dtype: Literal["float32", "bfloat16"] = "float32"
 
     @classmethod
     def create(cls, config: Config) -> "Architecture":

@@ -617,7 +617,7 @@ def _recomputed(
 def for_many_passes(arch: Architecture, params: Params) -> Params:
     """Returns the parameters as a loop around the network reads them fastest: rounded once, and blocks split."""
     blocks = params["blocks"]
-    if arch.feature_dtype == "bfloat16":
+    if arch.compute_dtype == "bfloat16":
         blocks = rounded(blocks)
     return params | {"blocks": apart(blocks, arch.blocks, arch.unroll)}
 

@@ -325,12 +325,12 @@ class Transformer(nn.Module):
 
 
 def run_transformer(arch: Architecture, params: Params, *inputs: Any, **options: Any) -> Any:
-    """Returns what :class:`Transformer` returns for these inputs, with ``arch.feature_dtype`` where that is faster."""
+    """Returns what :class:`Transformer` returns; its features have ``compute_dtype`` where that is faster."""
 
     def run(dtype: Any) -> Any:
         return Transformer(replace(arch, feature_dtype=dtype)).apply({"params": params}, *inputs, **options)
 
-    return in_feature_dtype(arch.feature_dtype, run)
+    return in_feature_dtype(arch.compute_dtype, run)
 
 
 def _rematerialised(config: Architecture) -> Any:

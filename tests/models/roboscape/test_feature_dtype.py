@@ -36,12 +36,12 @@ def test_a_program_for_a_cpu_keeps_features_in_float32() -> None:
     params = random_params(WIDE)
     arguments = random_inputs(WIDE)
     expected = Transformer(WIDE).apply({"params": params}, *arguments)[0]
-    found = run_transformer(NARROW, params, *arguments)[0]
+    found = run_transformer(WIDE, params, *arguments)[0]
     jax.tree.map(np.testing.assert_array_equal, found, expected)
 
 
 def test_a_program_for_a_gpu_has_features_in_bf16() -> None:
-    run = jax.jit(partial(run_transformer, NARROW)).trace(random_params(WIDE), *random_inputs(WIDE))
+    run = jax.jit(partial(run_transformer, WIDE)).trace(random_params(WIDE), *random_inputs(WIDE))
     clips, frames = random_inputs(WIDE)[1].shape[:2]
     features = f"tensor<{clips}x{frames}x{WIDE.grid**2}x{WIDE.width}xbf16>"
     assert features in run.lower(lowering_platforms=("cuda",)).as_text()
