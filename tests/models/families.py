@@ -21,9 +21,10 @@ RUNTIME = RuntimeConfig(log_every=1, checkpoint_every=2, eval_every=4)
 
 
 def engine(config: Config) -> Config:
-    """The configuration with two short trainings."""
+    """The configuration with two short trainings and a short evaluation."""
     tokenizer = replace(config.tokenizer_train, **TRAIN, frames_per_clip=3, depth_share=0.0)
-    return replace(config, tokenizer_train=tokenizer, train=TrainConfig(**TRAIN), runtime=RUNTIME)
+    scored = replace(config.eval, clips=2, action_draws=1, report_clips=1)
+    return replace(config, tokenizer_train=tokenizer, train=TrainConfig(**TRAIN), runtime=RUNTIME, eval=scored)
 
 
 def genie() -> Config:

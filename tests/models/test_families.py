@@ -165,7 +165,8 @@ def test_bf16_rounds_an_autoencoders_convolutions_and_keeps_its_parameters_and_o
     half = with_values(exact, {"model.autoencoder.compute_dtype": "bfloat16"})
     (one, shapes, batch), (other, same, _) = (next(families.batches_of(config)) for config in (exact, half))
     assert shapes == same and one.flops() == other.flops()
-    params = create_state(one, LoopConfig()).params
+    rng = np.random.default_rng(1)
+    params = jax.tree.map(lambda x: (0.1 * rng.normal(size=x.shape)).astype(np.float32), shapes)
     first, second = (
         jax.jit(each.loss_terms)(params, batch, jax.random.key(0), StepContext(jnp.int32(3), None, None))
         for each in (one, other)

@@ -34,16 +34,18 @@ class Commands:
     def train(self, run: Path, *arguments: object) -> subprocess.CompletedProcess[str]:
         return self("experiments.train", "debug", "--run-dir", run, *arguments)
 
-    def refused(self, module: str, *arguments: object) -> str:
-        """Returns the one line on standard error of a command that cannot be carried out.
-
-        It runs in this process: starting one takes seconds, and a refusal needs none of them.
-        """
-        with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stderr(io.StringIO()) as errors:
+    def here(self, module: str, *arguments: object) -> str:
+        """Runs a command in this process, since starting one takes seconds, and returns what it prints."""
+        with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(io.StringIO()) as printed:
             patch.setenv("GLIBC_TUNABLES", HUGE_PAGES)  # else the process would start over
             patch.setattr(sys, "argv", [module, *map(str, arguments), "--data-dir", str(self.data)])
-            with pytest.raises(SystemExit) as stop:
-                importlib.import_module(module if module.startswith("experiments") else f"{module}.__main__").main()
+            importlib.import_module(module if module.startswith("experiments") else f"{module}.__main__").main()
+        return printed.getvalue()
+
+    def refused(self, module: str, *arguments: object) -> str:
+        """Returns the one line on standard error of a command that cannot be carried out, run in this process."""
+        with contextlib.redirect_stderr(io.StringIO()) as errors, pytest.raises(SystemExit) as stop:
+            self.here(module, *arguments)
         line = errors.getvalue()
         assert stop.value.code == 2, line
         assert line.startswith("error: ")

@@ -32,17 +32,14 @@ def read(path: Path) -> np.ndarray:
 
 def generate(command: Commands, run: Path, out: Path, *arguments: object) -> dict[str, np.ndarray]:
     """What the command wrote, by file name, checked against what it printed."""
-    done = command(PROGRAM, run, "--out", out, *arguments)
-    assert done.returncode == 0, done.stderr
-    paths = [Path(line) for line in done.stdout.splitlines()]
+    paths = [Path(line) for line in command.here(PROGRAM, run, "--out", out, *arguments).splitlines()]
     assert sorted(paths) == sorted(out.iterdir())
     return {path.name: read(path) for path in paths}
 
 
-@pytest.mark.parametrize("kind", ["mp4", "gif"])
-def test_truth_and_prediction_side_by_side(debug: Path, command: Commands, tmp_path: Path, kind: str) -> None:
-    videos = generate(command, debug, tmp_path / "out", "--clips", 0, 1, "--format", kind)
-    assert list(videos) == [f"test_000.{kind}", f"test_001.{kind}"]
+def test_truth_and_prediction_side_by_side(debug: Path, command: Commands, tmp_path: Path) -> None:
+    videos = generate(command, debug, tmp_path / "out", "--clips", 0, 1, "--format", "gif")
+    assert list(videos) == ["test_000.gif", "test_001.gif"]
     for frames in videos.values():
         assert len(frames) == FRAMES
         assert frames.shape[2] > 2 * 64, "two pictures wide at least"
