@@ -195,9 +195,9 @@ class TransformerConfig:
     width: int = 256  # channels; the size of a model in the paper: 256, 512 or 1024
     blocks: int = 32  # of each branch
     heads: int = 8  # of each attention; more where a head would be wider than 64 channels
-    # bfloat16: operands of linear layers (accumulated in float32) and, on an accelerator or in frames of 128 cells or
-    # more, of attention within frames. Parameters, norms and softmaxes stay float32. CPUs without bf16 units still
-    # multiply linear layers in float32, which is faster there.
+    # bfloat16: operands of linear layers (accumulated in float32) and of attention within frames of 128 cells or more;
+    # on an accelerator also the features between layers. Parameters, norms' statistics, softmaxes and the loss stay
+    # float32. CPUs without bf16 units still multiply linear layers in float32, which is faster there.
     compute_dtype: Literal["float32", "bfloat16"] = "float32"
     unroll: int = runtime(1)  # blocks per iteration of the scan; more are faster on a CPU and compile longer
     # What the backward pass recomputes. none: nothing. blocks: everything but each block's input. products: the same,

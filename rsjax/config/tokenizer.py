@@ -31,9 +31,9 @@ class TokenizerConfig:
     # The paper tokenizes depth with the same MAGVIT-2; its colour map is unpublished (see rsjax/data/depth_color.py).
     depth_scale: Literal["linear", "inverse"] = "inverse"
 
-    # bfloat16: operands of convolutions, and on an accelerator their results; CPUs without bf16 units still convolve in
-    # float32, which is faster there. The public code trains in mixed half precision and is used in
-    # float32.
+    # bfloat16: operands of convolutions, and on an accelerator the features between layers; norms, latents and losses
+    # stay float32. CPUs without bf16 units still convolve in float32, which is faster there. The public code trains in
+    # mixed half precision and is used in float32.
     compute_dtype: Literal["float32", "bfloat16"] = "float32"
 
     def __post_init__(self) -> None:
