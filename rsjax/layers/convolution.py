@@ -3,6 +3,7 @@
 from typing import Any, Literal
 
 import flax.linen as nn
+import jax
 from jaxtyping import Array, Float
 
 from rsjax.layers.platform import convolve
@@ -10,11 +11,29 @@ from rsjax.layers.platform import convolve
 Dtype = Literal["float32", "bfloat16"]
 
 
-class Conv(nn.Conv):
-    """A convolution whose output has the number format of its input."""
+class Conv(nn.Module):
+    """A convolution with a square kernel and float32 parameters; its output has the number format of its input.
 
-    def __call__(self, inputs: Float[Array, "B h w C"]) -> Float[Array, "B h w D"]:
-        return super().__call__(inputs).astype(inputs.dtype)
+    Parameters have the names, shapes and initial values of flax's layer.
+    """
+
+    features: int
+    size: int
+    bf16: bool
+    stride: int = 1
+    padding: Any = "SAME"
+    use_bias: bool = True
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "B h w C"]) -> Float[Array, "B h w D"]:
+        shape = (self.size, self.size, x.shape[-1], self.features)
+        kernel = self.param("kernel", nn.initializers.lecun_normal(), shape)
+        run = convolve if self.bf16 else jax.lax.conv_general_dilated
+        strides = (self.stride, self.stride)
+        out = run(x, kernel, strides, self.padding, dimension_numbers=("NHWC", "HWIO", "NHWC"))
+        if self.use_bias:
+            out = out + self.param("bias", nn.initializers.zeros, (self.features,))
+        return out.astype(x.dtype)
 
 
 def conv(
@@ -31,6 +50,4 @@ def conv(
     Args:
         dtype: bfloat16: operands are rounded to bf16 where this is faster, and products are added up in float32.
     """
-    sizes = (kernel, kernel), (stride, stride)
-    how = convolve if dtype == "bfloat16" else None
-    return Conv(features, *sizes, padding=padding, use_bias=use_bias, name=name, conv_general_dilated=how)
+    return Conv(features, kernel, dtype == "bfloat16", stride, padding, use_bias, name=name)

@@ -38,7 +38,7 @@ def test_a_full_size_preset_has_no_departure(name: str) -> None:
     assert isinstance(model, TokenModelConfig)
     assert model.departures == Departures()
     assert model.corruption == CorruptionConfig()
-    assert model.sample == SampleConfig()
+    assert model.sample == SampleConfig(cache_dtype="bfloat16")
     assert active(model) == {}
 
 

@@ -136,7 +136,7 @@ def test_the_share_of_waiting_is_that_of_a_slow_loader(
     batches.enter_result = batches
     monkeypatch.setattr(parts, "Prefetch", lambda *_: batches)
     monkeypatch.setattr(parts, "time", SimpleNamespace(monotonic=lambda: clock[0]))
-    monkeypatch.setattr(parts.Sharding, "create", lambda loop: SimpleNamespace(compile=lambda *_: step))
+    monkeypatch.setattr(parts.Sharding, "create", lambda loop: SimpleNamespace(compile=lambda *_: step, put_batch=None))
     monkeypatch.setattr(parts, "create_state", lambda model, loop: 0)
     measured = bench(toy(), only=["feed"], budget=0.0)
     assert measured["data_wait_share"] == share
