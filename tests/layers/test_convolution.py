@@ -3,7 +3,6 @@
 from typing import Any
 from unittest import mock
 
-import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rsjax.layers.convolution import conv
+from rsjax.layers.convolution import Conv, conv
 from rsjax.layers.cpu import convolution
 from rsjax.layers.cpu.convolution import conv_bf16
 from rsjax.layers.platform import convolve
@@ -60,7 +59,7 @@ def test_a_layer_of_many_channels_takes_products_and_keeps_its_parameters(
     variables = exact.init(jax.random.key(1), x)
     jax.tree.map(np.testing.assert_array_equal, variables, half.init(jax.random.key(1), x))
 
-    def passes(layer: nn.Conv) -> tuple[Any, Any]:
+    def passes(layer: Conv) -> tuple[Any, Any]:
         def total(variables: Any, x: Any) -> Any:
             out: Any = layer.apply(variables, x)
             return jnp.sin(out).sum()
