@@ -1,40 +1,49 @@
-"""Operations of kernels that a compiler cannot look into (Pallas), for counts of a program's cost."""
+"""Operations of kernels that a compiler cannot look into (Pallas), for counts of a program's cost.
+
+All products of a kernel count, as the hardware does them: those that a gradient computes again, pairs that a mask hides,
+and the lanes of zeros that stand for other heads on a TPU.
+"""
 
 from collections.abc import Callable, Sequence
 from math import prod
 
-from rsjax.layers import packed_attention
-from rsjax.layers.gpu import feed_forward, mlp
-
 Shapes = Sequence[tuple[int, ...]]
 
+LANES = 128  # of a TPU's register
 
-def attention(products: int) -> Callable[[Shapes, Shapes], float]:
-    """Returns the count of an attention kernel with so many products of queries × keys × width.
 
-    Its first operands are queries (B, T, heads, width) and keys (B, S, heads, width). The forward pass has 2 products,
-    the backward pass 5, since it computes the scores again.
+def attention(qkv: tuple[int, ...], log_sum: tuple[int, ...], of_all_lanes: int, of_head: int) -> int:
+    """Returns the operations of attention in tiles (rsjax/layers/gpu/attention.py and tpu/attention.py).
+
+    Each head of a tile multiplies all its R rows with each other.
+
+    Args:
+        qkv: shape (B, T, S, 3, h, e) on a GPU, (B, T, S, 3·h·e) on a TPU.
+        log_sum: shape (B, N, h, R), for N tiles of R rows.
+        of_all_lanes: products which on a TPU have lanes of all heads in a register, those of one being nonzero.
+        of_head: products of one head's channels.
     """
+    clips, tiles, heads, rows = log_sum
+    width = prod(qkv[3:]) // (3 * heads)
+    on_tpu = len(qkv) == 4
+    lanes = LANES if on_tpu else width
+    return 2 * clips * tiles * heads * rows**2 * (of_all_lanes * lanes + of_head * width)
 
-    def count(operands: Shapes, results: Shapes) -> float:
-        keys = operands[1][1]
-        return products * 2 * prod(operands[0]) * keys
 
-    return count
+def products(rows: tuple[int, ...], kernel: tuple[int, ...], count: int) -> int:
+    """Returns the operations of so many products of rows (N, C) and a kernel (C, H) or its transpose."""
+    return count * 2 * rows[0] * prod(kernel)
 
 
-# By the kernel's name, which is pallas_call's ``name`` or that of the jitted function around it: a function of the
-# shapes of operands and results that returns the operations of one call, 2 per multiply-add.
-KERNEL_FLOPS: dict[str, Callable[[Shapes, Shapes], float]] = {
-    "mha_forward": attention(2),  # jax.experimental.pallas.ops.gpu.attention
-    "mha_preprocess_backward": lambda operands, results: 2 * prod(operands[0]),
-    "mha_backward": attention(5),
-    "attend_cells_forward": lambda operands, results: packed_attention.flops(operands[0], "cells")[0],
-    "attend_cells_backward": lambda operands, results: packed_attention.flops(operands[0], "cells")[1],
-    "attend_frames_forward": lambda operands, results: packed_attention.flops(operands[0], "frames")[0],
-    "attend_frames_backward": lambda operands, results: packed_attention.flops(operands[0], "frames")[1],
-    "mlp_forward": lambda operands, results: mlp.flops(operands[0][0], *operands[1]),
-    "mlp_backward": lambda operands, results: mlp.flops(operands[0][0], *operands[2]),
-    "feed_forward_forward": lambda operands, results: feed_forward.flops(operands[0][0], *operands[1]),
-    "feed_forward_backward": lambda operands, results: feed_forward.flops(operands[0][0], *operands[2]),
+# By pallas_call's ``name``: a function of the shapes of operands and results that returns the operations of one call,
+# 2 per multiply-add.
+KERNEL_FLOPS: dict[str, Callable[[Shapes, Shapes], int]] = {
+    "attend_cells_forward": lambda operands, results: attention(operands[0], results[1], 1, 1),
+    "attend_cells_backward": lambda operands, results: attention(operands[0], operands[3], 2, 3),
+    "attend_frames_forward": lambda operands, results: attention(operands[0], results[1], 1, 1),
+    "attend_frames_backward": lambda operands, results: attention(operands[0], operands[3], 2, 3),
+    "mlp_forward": lambda operands, results: products(operands[0], operands[1], 2),
+    "mlp_backward": lambda operands, results: products(operands[0], operands[2], 3),
+    "feed_forward_forward": lambda operands, results: products(operands[0], operands[1], 1),
+    "feed_forward_backward": lambda operands, results: products(operands[0], operands[2], 2),
 }

@@ -28,23 +28,6 @@ class Tile(NamedTuple):
         return self.frames * self.cells
 
 
-def flops(shape: tuple[int, ...], over: Over) -> tuple[int, int]:
-    """Returns the operations of the products of one call, forward and backward, two a multiply-add.
-
-    Of attention over frames only pairs of a query and a key that it sees count, though a tile multiplies all its pairs.
-    The backward pass has four products; that kernels recompute scores, half of the forward count, is left out.
-
-    Args:
-        shape: of qkv, (B, T, S, 3, h, e) or (B, T, S, 3·h·e).
-    """
-    clips, frames, cells, *packed = shape
-    channels = math.prod(packed) // 3
-    pairs = clips * frames * cells**2
-    if over == "frames":
-        pairs = clips * cells * frames * (frames + 1) // 2
-    return 4 * pairs * channels, 8 * pairs * channels
-
-
 def scale(width: int) -> float:
     """Returns the factor of scores: 1/√e, for powers of two, which are faster than those of e."""
     return math.log2(math.e) / math.sqrt(width)

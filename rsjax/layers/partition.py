@@ -31,12 +31,17 @@ def gathers(block: type[nn.Module]) -> Any:
     return nn.map_variables(block, "params", trans_in_fn=gathered, init=True)
 
 
+def devices_are_known() -> bool:
+    """Returns whether a program being traced is for one device, or for a mesh that is set."""
+    return jax.device_count() == 1 or bool(jax.sharding.get_abstract_mesh().axis_names)
+
+
 def each_own_clips(run: Callable[..., Any], settings: int, shared: int = 0) -> Callable[..., Any]:
     """Returns a function that runs on each device with the clips it holds.
 
     It finds out how clips are sharded by itself. On TPUs this does not work yet (github.com/jax-ml/jax/issues/38196):
     there, a program for several devices must be traced under ``jax.set_mesh(mesh)``, over all of whose axes clips are
-    divided.
+    divided, or use no kernel (:func:`devices_are_known`).
 
     Args:
         run: takes settings, arrays with a leading axis over clips, and shared arrays, and returns arrays with a leading

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rsjax.layers.gpu.attention import attend, fits
-from rsjax.layers.packed_attention import Over, flops
+from rsjax.layers.packed_attention import Over
 from tests.layers.attention_reference import assert_like_plain
 
 SHAPES = [
@@ -46,8 +46,3 @@ def test_a_frame_does_not_change_the_frames_before_it() -> None:
 )
 def test_other_shapes_do_not_fit(over: Over, shape: tuple[int, ...]) -> None:
     assert not fits(shape, over)
-
-
-def test_operations_count_pairs_that_are_seen() -> None:
-    assert flops((2, 4, 16, 3, 2, 32), "cells") == (4 * 8 * 16**2 * 64, 8 * 8 * 16**2 * 64)
-    assert flops((2, 4, 16, 3 * 64), "frames") == (4 * 32 * 10 * 64, 8 * 32 * 10 * 64)

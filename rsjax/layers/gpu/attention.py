@@ -19,10 +19,10 @@ from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton
 from jaxtyping import Array, Float
 
-from rsjax.layers.packed_attention import ATTENTION, HEAD_WIDTHS, Over, Tile, flops, product, scale, sees
+from rsjax.layers.packed_attention import ATTENTION, HEAD_WIDTHS, Over, Tile, product, scale, sees
 from rsjax.layers.partition import each_own_clips
 
-__all__ = ["ATTENTION", "Over", "attend", "fits", "flops"]
+__all__ = ["ATTENTION", "Over", "attend", "fits"]
 
 ROWS = 64  # tokens of a tile over frames
 QUERIES = 128  # of a program of the forward pass

@@ -138,14 +138,6 @@ def _run_backward(
     return h, to_h, to_b1.reshape(len(x), -1, hidden)
 
 
-def flops(rows: int, width: int, hidden: int) -> int:
-    """Returns the operations of one call of either kernel: those of one product, two a multiply-add.
-
-    That the backward kernel computes the first product again is left out, and so are the plain products.
-    """
-    return 2 * rows * width * hidden
-
-
 def _across(rows: int, width: int) -> pl.BlockSpec:
     return pl.BlockSpec((rows, width), lambda j, i: (i, 0))
 

@@ -154,15 +154,6 @@ def _run_backward(
     return (to_x.reshape(x.shape), *(one.reshape(*x.shape[:-1], hidden) for one in (h, to_h)), *by_tile, *normed)
 
 
-def flops(rows: int, width: int, hidden: int) -> int:
-    """Returns the operations of the products in one call of either kernel, two a multiply-add.
-
-    Those for the weights' gradients are not in a kernel. The backward kernel computes the first product again; this,
-    half of the count, is left out.
-    """
-    return 4 * rows * width * hidden
-
-
 def _rows(tile: int, width: int) -> pl.BlockSpec:
     return pl.BlockSpec((tile, width), _row)
 

@@ -24,10 +24,10 @@ from jax.experimental import pallas as pl
 from jax.experimental.pallas import tpu
 from jaxtyping import Array, Float
 
-from rsjax.layers.packed_attention import ATTENTION, HEAD_WIDTHS, Over, Tile, flops, product, scale, sees
+from rsjax.layers.packed_attention import ATTENTION, HEAD_WIDTHS, Over, Tile, product, scale, sees
 from rsjax.layers.partition import each_own_clips
 
-__all__ = ["ATTENTION", "Over", "attend", "fits", "flops"]
+__all__ = ["ATTENTION", "Over", "attend", "fits"]
 
 LANES = 128
 MOST_CHANNELS = 1024  # of 256 rows, for the memory on chip

@@ -164,9 +164,11 @@ def test_operations_inside_kernels_of_libraries_are_counted_by_formula() -> None
 
 
 def test_a_kernel_counts_what_its_author_registered_and_an_unknown_one_is_reported() -> None:
-    heads = "bf16[2,6,4,8]{3,2,1,0}"
-    known = call("__gpu$xla.gpu.triton", f"{heads} {heads} {heads}", heads, name="jit(f)/mha_forward/pallas_call")
-    assert known.flops == 2 * 2 * (2 * 6 * 4 * 8) * 6 and not known.warnings
+    qkv = "bf16[2,6,16,3,4,8]{5,4,3,2,1,0}"
+    heads = "bf16[2,6,16,4,8]{4,3,2,1,0}"
+    results = f"({heads}, f32[2,6,4,16]{{3,2,1,0}})"
+    known = call("__gpu$xla.gpu.triton", qkv, results, name="jit(f)/attend_cells_forward/pallas_call")
+    assert known.flops == 2 * 2 * (2 * 6 * 4) * 16**2 * 8 and not known.warnings
     unknown = call("__gpu$xla.gpu.triton", heads, heads, name="jit(f)/mystery/pallas_call")
     assert unknown.flops == 0 and "mystery" in unknown.warnings[0]
 
