@@ -34,6 +34,8 @@ def upgraded(config: dict[str, Any]) -> dict[str, Any]:
         upgrade_model(model)
     if "mask" in model:
         split_model(model)
+    if "use_keypoints" in model.get("loss", {}):
+        choose_keypoints(model["loss"])
     if "adversarial_weight" in config["tokenizer_train"]:
         split_tokenizer_train(config["tokenizer_train"])
         gather_weights(config["eval"])
@@ -82,6 +84,12 @@ def split_model(model: dict[str, Any]) -> None:
         del section[name]
     if "loss" in model:
         del model["loss"]["rgb_weight"]
+
+
+def choose_keypoints(loss: dict[str, Any]) -> None:
+    """Replaces the switch of the keypoint terms by the choice of one."""
+    words = {True: "printed", False: "none"}
+    loss["keypoints"] = words[loss.pop("use_keypoints")]
 
 
 def split_tokenizer_train(train: dict[str, Any]) -> None:

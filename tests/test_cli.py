@@ -69,14 +69,14 @@ def test_flags_that_repeat_the_preset_change_nothing(flags: list[tuple[str, str]
 def test_overrides_reach_their_field_and_no_other() -> None:
     config, options = read(
         "debug",
-        *("--train.steps", "7", "--model.loss.use-keypoints", "False", "--sim.test-episodes=3", "--run-dir", "there"),
+        *("--train.steps", "7", "--model.loss.keypoints", "none", "--sim.test-episodes=3", "--run-dir", "there"),
         *("--tokenizer.channel_multipliers", "2", "4", "--no-resume"),
     )
     base = presets.get("debug")
     assert config == dataclasses.replace(
         base,
         train=dataclasses.replace(base.train, steps=7),
-        model=dataclasses.replace(base.model, loss=LossConfig(num_keypoints=8, use_keypoints=False)),  # type: ignore[call-arg]
+        model=dataclasses.replace(base.model, loss=LossConfig(num_keypoints=8, keypoints="none")),  # type: ignore[call-arg]
         sim=dataclasses.replace(base.sim, test_episodes=3),
         tokenizer=dataclasses.replace(base.tokenizer, channel_multipliers=(2, 4)),
     )

@@ -178,7 +178,9 @@ class LossConfig:
     keypoint_weight: float = 0.01  # λ₂
     attention_weight: float = 1.0  # λ₃
     gamma: float = 5.0  # γ of Eq. 6
-    use_keypoints: bool = True  # False: without the keypoint and attention terms
+    # The keypoint term. printed: Eq. 5, whose minimum is not the truth. difference: the change of a point's code from
+    # frame to frame (rsjax.models.roboscape.departures.keypoint_difference). none: neither a keypoint term nor Eq. 7.
+    keypoints: Literal["none", "printed", "difference"] = "printed"
     num_keypoints: int = 32  # K of the top-K, at most all tracks; the paper does not give its K
 
     def __post_init__(self) -> None:
@@ -290,12 +292,12 @@ class RoboScapeConfig(TokenModelConfig):
 
     @property
     def marked_keypoints(self) -> int:
-        return self.loss.num_keypoints if self.loss.use_keypoints else 0
+        return 0 if self.loss.keypoints == "none" else self.loss.num_keypoints
 
     @property
     def loss_weights(self) -> dict[str, float]:
         off = set() if self.use_depth else {"depth"}
-        off |= set() if self.loss.use_keypoints else {"keypoint", "attention"}
+        off |= {"keypoint", "attention"} if self.loss.keypoints == "none" else set()
         return {"rgb": 1.0} | {name: weight for name, weight in loss_weights(self.loss).items() if name not in off}
 
 

@@ -257,7 +257,7 @@ def test_a_model_without_actions_fits_any_data() -> None:
 
 
 def test_more_keypoints_than_tracks_are_fine() -> None:
-    config = with_values(BASE, {"model.loss.num_keypoints": 10_000, "model.loss.use_keypoints": False})
+    config = with_values(BASE, {"model.loss.num_keypoints": 10_000, "model.loss.keypoints": "none"})
     assert isinstance(config.model, c.RoboScapeConfig)
     assert config.model.loss_weights == {"rgb": 1.0, "depth": 1.0}
     assert with_values(BASE, {"model.loss.num_keypoints": 65}).clips.tracks == 64

@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Int, Int32
 from rsjax import clip
 from rsjax.config import RoboScapeConfig, TokenModelConfig
 from rsjax.models.roboscape.architecture import Architecture
+from rsjax.models.roboscape.departures.keypoint_difference import difference, seen_steps
 from rsjax.models.roboscape.departures.masked_keypoints import compared
 from rsjax.models.roboscape.departures.observed_anchor import anchor
 from rsjax.models.roboscape.departures.visible_keypoints import counted_frames
@@ -93,18 +94,24 @@ def loss_terms(
         masked_depth = mask * clips[:, None, None, None]
         terms["depth"] = jnp.sum(depth_nats * masked_depth), jnp.sum(masked_depth)
 
-    if isinstance(config, RoboScapeConfig) and config.loss.use_keypoints:
+    if isinstance(config, RoboScapeConfig) and config.loss.keypoints != "none":
         # T_sample: the K tracks of the largest M_i, on the token grid.
         count = min(config.loss.num_keypoints, batch.tracks.shape[1])
         keypoints = select(batch.tracks, counted_frames(departures, batch.visible), count, grid)
 
-        # Eq. 5: L_Keypoint = 1/((T-1)K) Σ_i Σ_t≥2 ‖ŝ_t(p_i^t) - ŝ_1(p_i^1)‖².
-        cells = keypoints.cells.swapaxes(1, 2)  # B T K
         s_hat = lfq.mean_codes(logits["rgb"], bits)  # B T S D
         first = anchor(departures, s_hat, targets["rgb"])
-        distance = keypoint_distance(s_hat, first, cells)
-        counts = keypoints.visible.swapaxes(1, 2)[:, 1:] * batch.weight[:, None, None]
-        counts = counts * compared(departures, mask, cells)[:, 1:]
+        if config.loss.keypoints == "printed":
+            # Eq. 5: L_Keypoint = 1/((T-1)K) Σ_i Σ_t≥2 ‖ŝ_t(p_i^t) - ŝ_1(p_i^1)‖².
+            cells = keypoints.cells.swapaxes(1, 2)  # B T K
+            distance = keypoint_distance(s_hat, first, cells)
+            counts = keypoints.visible.swapaxes(1, 2)[:, 1:]
+        else:
+            cells = token_cells(batch.tracks, grid).swapaxes(1, 2)  # B T N
+            s = lfq.tokens_to_codes(targets["rgb"], bits).reshape(s_hat.shape)
+            distance = difference(jnp.concatenate([first, s_hat[:, 1:]], axis=1), s, cells)
+            counts = seen_steps(batch.visible)
+        counts = counts * batch.weight[:, None, None] * compared(departures, mask, cells)[:, 1:]
         terms["keypoint"] = jnp.sum(distance * counts), jnp.sum(counts)
 
         # Eq. 6 and 7: L_Attention = -Σ_t A_t ⊙ s_t log p(ŝ_t). It is divided by the number of cells, not by Σ A.

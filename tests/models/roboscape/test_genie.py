@@ -81,7 +81,7 @@ def test_its_parameters_and_loss_are_those_of_the_rgb_branch(encoder: Any) -> No
     corruption = CorruptionConfig(probability=1.0)
     small: dict[str, Any] = {"width": 8, "blocks": 1, "heads": 2, "corruption": corruption, "action_encoder": encoder}
     genie = create_model(debug(GenieConfig(**small)))
-    loss = LossConfig(use_keypoints=False)
+    loss = LossConfig(keypoints="none")
     alone = create_model(debug(RoboScapeConfig(use_depth=False, loss=loss, **small)))
     assert (type(genie), type(alone)) == (Genie, RoboScape)
     assert genie.loss_weights == alone.loss_weights == {"rgb": 1.0}

@@ -57,13 +57,14 @@ def random_batch(clips: int = 3) -> Batch:
 
 
 @pytest.mark.parametrize("depth", [True, False])
-@pytest.mark.parametrize("keypoints", [True, False])
-def test_what_is_off_has_no_term(depth: bool, keypoints: bool) -> None:
-    model, loss = replace(MODEL, use_depth=depth), replace(LOSS, use_keypoints=keypoints)
+@pytest.mark.parametrize("keypoints", ["none", "printed", "difference"])
+def test_what_is_off_has_no_term(depth: bool, keypoints: Any) -> None:
+    model = replace(MODEL, use_depth=depth)
+    loss = replace(LOSS, keypoints=keypoints)
     shapes = jax.eval_shape(Transformer(model).init_params, KEY)
     terms = jax.eval_shape(partial(terms_of, model, loss), shapes, random_batch())
     assert terms.keys() == model_of(model, loss).loss_weights.keys()
-    assert ("depth" in terms, "keypoint" in terms, "attention" in terms) == (depth, keypoints, keypoints)
+    assert ("depth" in terms, "keypoint" in terms, "attention" in terms) == (depth, *2 * [keypoints != "none"])
 
 
 @pytest.mark.parametrize("has_depth", [None, (1, 0, 1), (0, 0, 0)])
@@ -180,7 +181,7 @@ def test_rgb_terms_teach_the_depth_branch_and_not_the_other_way_round() -> None:
 
 
 def test_training_on_dropped_actions_teaches_the_null_action_and_the_encoder() -> None:
-    model, loss = depart(MODEL, action_dropout=0.5), LossConfig(use_keypoints=False)
+    model, loss = depart(MODEL, action_dropout=0.5), LossConfig(keypoints="none")
     params, batch = random_params(model), random_batch(8)
     drop = dropped_actions(0.5, KEY, batch.index)
     assert {False, True} == set(np.asarray(drop).tolist())

@@ -21,14 +21,15 @@ from rsjax.progress import note
 
 Value = bool | int | float | str
 
-DEFAULT_AXES = ("model.use_depth=True,False", "model.loss.use_keypoints=True,False")
+DEFAULT_AXES = ("model.use_depth=True,False", "model.loss.keypoints=printed,none")
 SWITCHES = {  # a field → the switch without which the field has no effect
     "model.loss.depth_weight": "model.use_depth",
-    "model.loss.keypoint_weight": "model.loss.use_keypoints",
-    "model.loss.attention_weight": "model.loss.use_keypoints",
-    "model.loss.gamma": "model.loss.use_keypoints",
-    "model.loss.num_keypoints": "model.loss.use_keypoints",
+    "model.loss.keypoint_weight": "model.loss.keypoints",
+    "model.loss.attention_weight": "model.loss.keypoints",
+    "model.loss.gamma": "model.loss.keypoints",
+    "model.loss.num_keypoints": "model.loss.keypoints",
 }
+OFF: tuple[Value, ...] = (False, "none")  # values of a switch that is off
 SEED = "train.seed"
 FILE = "grid.json"
 LIBRARIES = ("rsjax", "jax", "flax", "optax", "numpy")  # libraries whose versions the file records
@@ -181,10 +182,20 @@ def repeated_cells(grid: Grid) -> list[str]:
     cells = [config_fields(config) for config in grid.cells.values()]
     lines = []
     for field, switch in SWITCHES.items():
-        off = {known[field].value for known in cells if field in known and switch in known and not known[switch].value}
-        if field in grid.fields and len(off) > 1:
-            lines.append(f"{field} has no effect where {switch} is False; cells that differ in it alone are the same")
+        if field not in grid.fields:
+            continue
+        for word in OFF:
+            off = {known[field].value for known in cells if field in known and off_by(known, switch, word)}
+            if len(off) > 1:
+                lines.append(
+                    f"{field} has no effect where {switch} is {word}; cells that differ in it alone are the same"
+                )
     return lines
+
+
+def off_by(fields: Mapping[str, ConfigField], switch: str, word: Value) -> bool:
+    """Whether this switch is among a configuration's fields and has this value."""
+    return switch in fields and fields[switch].value == word
 
 
 def merge(before: Grid | None, new: Grid, out: Path) -> tuple[Grid, tuple[str, ...]]:

@@ -45,9 +45,14 @@ def published_name(model: Mapping[str, Any]) -> str | None:
     if name != "RoboScape":
         return name
     depth = settings.get("use_depth", True)
-    keypoints = settings.get("loss", {}).get("use_keypoints", True)
-    missing = {(False, True): " w/o depth", (True, False): " w/o keypoints", (False, False): " w/o both"}
-    return name + missing.get((depth, keypoints), "")
+    keypoints = settings.get("loss", {}).get("keypoints", "printed")
+    rows = {
+        (True, "printed"): "RoboScape",
+        (False, "printed"): "RoboScape w/o depth",
+        (True, "none"): "RoboScape w/o keypoints",
+        (False, "none"): "RoboScape w/o both",
+    }
+    return rows.get((depth, keypoints))
 
 
 def published(name: str, protocol: str) -> dict[str, float]:

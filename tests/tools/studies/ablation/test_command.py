@@ -10,10 +10,10 @@ from tests.tools.pipeline.conftest import Commands
 def test_a_cell_is_the_run_that_its_configuration_makes_alone(debug: Path, command: Commands, tmp_path: Path) -> None:
     """The cell whose values are the preset's own scores as the preset's run does."""
     out = tmp_path / "grid"
-    grid = "model.loss.use_keypoints=True"
+    grid = "model.loss.keypoints=printed"
     done = command("experiments.ablation", "debug", "--grid", grid, "--seeds", 0, "--out", out)
     assert done.returncode == 0, done.stdout + done.stderr
-    assert "| True | 1/1 |" in " ".join(done.stdout.split())
+    assert "| printed | 1/1 |" in " ".join(done.stdout.split())
     cell = out / f"{grid},seed=0"
     metrics = [json.loads((run / "metrics.json").read_text()) | {"seconds_total": 0} for run in (debug, cell)]
     assert metrics[0] == metrics[1]

@@ -32,7 +32,7 @@ from tests.tools.studies.ablation import toy
 DEBUG = presets.debug()
 VALUES = {
     "model.use_depth": st.booleans(),
-    "model.loss.use_keypoints": st.booleans(),
+    "model.loss.keypoints": st.sampled_from(["none", "printed", "difference"]),
     "model.loss.depth_weight": st.floats(0, 10),
     "model.loss.gamma": st.floats(0, 100),
     "model.loss.num_keypoints": st.integers(1, DEBUG.sim.tracks),
@@ -84,7 +84,7 @@ def test_without_axes_there_is_a_cell_per_seed() -> None:
 
 def test_the_default_is_depth_and_keypoints_on_and_off() -> None:
     models = map(toy.roboscape, toy.grid(*DEFAULT_AXES).cells.values())
-    assert [(m.use_depth, m.loss.use_keypoints) for m in models] == list(product((True, False), repeat=2))
+    assert [(m.use_depth, m.loss.keypoints) for m in models] == list(product((True, False), ("printed", "none")))
 
 
 def test_the_named_fields_exist() -> None:
@@ -149,9 +149,9 @@ def test_seeds_are_distinct_and_in_range(seeds: tuple[int, ...]) -> None:
 
 
 def test_a_weight_of_a_term_that_is_off_is_reported() -> None:
-    gamma, switch = "model.loss.gamma", "model.loss.use_keypoints"
-    assert repeated_cells(toy.grid(f"{gamma}=4,5", f"{switch}=True,False")) == [
-        f"{gamma} has no effect where {switch} is False; cells that differ in it alone are the same"
+    gamma, switch = "model.loss.gamma", "model.loss.keypoints"
+    assert repeated_cells(toy.grid(f"{gamma}=4,5", f"{switch}=printed,none")) == [
+        f"{gamma} has no effect where {switch} is none; cells that differ in it alone are the same"
     ]
     assert not repeated_cells(toy.grid("model.loss.gamma=4,5", "model.use_depth=True,False"))
 

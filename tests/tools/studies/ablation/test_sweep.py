@@ -267,14 +267,14 @@ def test_the_command_runs_lists_and_reports(
             return int(stop.code or 0)
         return 0
 
-    axes = ("--grid", "model.loss.gamma=4,5", "--grid", "model.loss.use_keypoints=True", "--seeds", "0", "1")
+    axes = ("--grid", "model.loss.gamma=4,5", "--grid", "model.loss.keypoints=printed", "--seeds", "0", "1")
     assert main("--table") == 2
     assert "holds no grid" in capsys.readouterr().err
     assert main(*axes, "--list") == 0
     assert capsys.readouterr().out.splitlines()[1].split() == [
         "1",
         "missing",
-        "model.loss.gamma=5.0,model.loss.use_keypoints=True,seed=0",
+        "model.loss.gamma=5.0,model.loss.keypoints=printed,seed=0",
     ]
     assert not (tmp_path / "out").exists()
     with monkeypatch.context() as patch:
@@ -283,7 +283,7 @@ def test_the_command_runs_lists_and_reports(
     assert main(*axes, "--list") == 0
     assert [row.split()[1] for row in capsys.readouterr().out.splitlines()[-4:]] == ["missing"] * 3 + ["finished"]
     with monkeypatch.context() as patch:
-        fail_in(patch, "model.loss.gamma=4.0,model.loss.use_keypoints=True,seed=0", UserError("its cure"))
+        fail_in(patch, "model.loss.gamma=4.0,model.loss.keypoints=printed,seed=0", UserError("its cure"))
         assert main(*axes) == 1
     assert "seed=0: failed (its cure)" in capsys.readouterr().out
     assert main("--table") == 0

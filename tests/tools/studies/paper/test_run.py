@@ -311,7 +311,7 @@ def test_a_clip_is_shown_as_every_arm_predicts_it(tmp_path: Path, monkeypatch: p
 
     def frames(folder: Path) -> dict[str, np.ndarray]:
         assert folder.name == "evaluation"  # where result.json and the frames are
-        rows, shift = kept["without" if "use_keypoints" in str(folder) else "with"]
+        rows, shift = kept["without" if "keypoints=none" in str(folder) else "with"]
         truth = np.zeros((len(rows), 4, 8, 8, 3), np.uint8)
         shifted = truth + np.array(shift, np.uint8)[:, None, None, None, None]
         return {"rows": np.array(rows), "truth": truth, "prediction": shifted}

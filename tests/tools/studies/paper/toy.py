@@ -28,7 +28,7 @@ def claim(name: str = "toy", *comparisons: Comparison, rank: int = 0) -> Claim:
         place="Table 9",
         arms=(
             Arm("with", published={"psnr": 21.5}),
-            Arm("without", {"model.loss.use_keypoints": False}, published={"psnr": 21.0}),
+            Arm("without", {"model.loss.keypoints": "none"}, published={"psnr": 21.0}),
         ),
         comparisons=comparisons or pairs("with", "without", "psnr"),
         rank=rank,
@@ -41,7 +41,7 @@ def plan(*claims: Claim, seconds: float = 10 * budget.HOUR) -> Plan:
 
 def keypoints(config: Config) -> bool:
     assert isinstance(config.model, RoboScapeConfig)
-    return config.model.loss.use_keypoints
+    return config.model.loss.keypoints != "none"
 
 
 def stub_stages(monkeypatch: pytest.MonkeyPatch, record: Path, gain: float = 0.5, noise: float = 0.01) -> None:

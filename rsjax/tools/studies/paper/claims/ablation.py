@@ -1,10 +1,17 @@
 """Table 2: what the two physics-informed objectives contribute."""
 
+from typing import Any
+
 from rsjax.tools.studies.compare.published import published_by_metric
 from rsjax.tools.studies.paper.claim import Arm, Claim, pairs, register
 
 # Depth errors must be an estimator's, since the model without depth has them too.
 _DEPTH = tuple(f"depth_{name}_median_estimator" for name in ("absrel", "delta1", "delta2"))
+_WITHOUT: dict[str, dict[str, Any]] = {
+    "w/o depth": {"model.use_depth": False},
+    "w/o keypoints": {"model.loss.keypoints": "none"},
+    "w/o both": {"model.use_depth": False, "model.loss.keypoints": "none"},
+}
 
 register(
     Claim(
@@ -20,11 +27,7 @@ register(
             Arm("full", published=published_by_metric("RoboScape")),
             *(
                 Arm(name, without, published=published_by_metric(f"RoboScape {name}"))
-                for name, without in {
-                    "w/o depth": {"model.use_depth": False},
-                    "w/o keypoints": {"model.loss.use_keypoints": False},
-                    "w/o both": {"model.use_depth": False, "model.loss.use_keypoints": False},
-                }.items()
+                for name, without in _WITHOUT.items()
             ),
         ),
         comparisons=(
