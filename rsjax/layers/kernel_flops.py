@@ -1,7 +1,7 @@
 """Operations of kernels that a compiler cannot look into (Pallas), for counts of a program's cost.
 
-All products of a kernel count, as the hardware does them: those that a gradient computes again, pairs that a mask hides,
-and the lanes of zeros that stand for other heads on a TPU.
+All products of a kernel count, as the hardware does them: those that a gradient computes again, pairs that a mask
+hides, and the lanes of zeros that stand for other heads on a TPU.
 """
 
 from collections.abc import Callable, Sequence
