@@ -22,6 +22,7 @@ from rsjax.layers.cpu import matmul as cpu_matmul
 from rsjax.layers.gpu import attention as gpu
 from rsjax.layers.gpu import feed_forward as gpu_feed_forward
 from rsjax.layers.gpu import mlp as gpu_mlp
+from rsjax.layers.partition import devices_are_known
 from rsjax.layers.tpu import attention as tpu
 
 
@@ -57,7 +58,7 @@ def attend_in_clip(
     kernels = {}
     if qkv.dtype == jnp.bfloat16 and gpu.fits(qkv.shape, over):
         kernels["cuda"] = partial(gpu.attend, over=over)
-    if qkv.dtype == jnp.bfloat16 and tpu.fits(qkv.shape, over):
+    if qkv.dtype == jnp.bfloat16 and tpu.fits(qkv.shape, over) and devices_are_known():
         kernels["tpu"] = partial(tpu.attend, over=over)
     return jax.lax.platform_dependent(qkv, default=plain, **kernels)
 

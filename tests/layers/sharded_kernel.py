@@ -4,6 +4,8 @@ XLA_FLAGS=--xla_force_host_platform_device_count=2 python -m tests.layers.sharde
 """
 
 import json
+from contextlib import nullcontext
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +15,7 @@ from jaxtyping import Array
 
 from rsjax.layers.gpu.attention import attend
 from rsjax.layers.gpu.mlp import mlp
+from rsjax.layers.platform import attend_in_clip
 
 
 def loss(qkv: Array) -> Array:
@@ -21,6 +24,14 @@ def loss(qkv: Array) -> Array:
     fc1 = (jnp.full((128, 64), 0.01), jnp.zeros(64))
     fc2 = (jnp.full((64, 128), 0.01), jnp.zeros(128))
     return jnp.sum(mlp(x, (jnp.full(128, 2.0), jnp.ones(128)), fc1, fc2, interpret=True) ** 2)
+
+
+def tpu_kernels(mesh: Mesh | None) -> int:
+    """Returns the number of kernels in attention lowered for TPUs, traced under this mesh."""
+    run = jax.jit(partial(attend_in_clip, over="cells", bf16=True))
+    qkv = jax.ShapeDtypeStruct((2, 1, 128, 3, 4, 32), jnp.bfloat16)
+    with nullcontext() if mesh is None else jax.set_mesh(mesh):
+        return str(run.trace(qkv).lower(lowering_platforms=("tpu",)).as_text()).count("tpu_custom_call")
 
 
 def main() -> None:
@@ -39,6 +50,7 @@ def main() -> None:
         "mesh": float(jnp.max(jnp.abs(gradient - truth))),
         "set mesh": float(jnp.max(jnp.abs(on_set_mesh(jax.device_put(qkv, clips)) - truth))),
         "pmap": float(jnp.max(jnp.abs(by_pmap - truth))),
+        "tpu kernels": [tpu_kernels(None), tpu_kernels(mesh)],
     }
     print(json.dumps(figures))
 
