@@ -202,8 +202,8 @@ class TransformerConfig:
     # float32. CPUs without bf16 units still multiply linear layers in float32, which is faster there.
     compute_dtype: Literal["float32", "bfloat16"] = "float32"
     unroll: int = runtime(1)  # blocks per iteration of the scan; more are faster on a CPU and compile longer
-    # What the backward pass recomputes. none: nothing. blocks: everything but each block's input. products: the same,
-    # but linear layers' outputs are kept too (less work, more memory).
+    # What the backward pass recomputes. none: nothing. blocks: everything but each block's inputs and a depth block's
+    # output. products: the same, but linear layers' outputs are kept too (less work, more memory).
     remat: Literal["none", "products", "blocks"] = runtime("none")
     public_code: PublicCodeConfig | None = None
     departures: Departures = Departures()  # what the paper does not have

@@ -14,6 +14,7 @@ from typing import Any
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float, Int
 
 from rsjax.layers.attention import KeyValues, attend, attend_few, frames_held, packed, put_frames, unpacked
@@ -39,6 +40,7 @@ Cache = StackedCache | list[StackedCache]  # of all blocks; or of each, split by
 
 Features = Float[Array, "B T S C"]
 
+DEPTH = "depth"  # the name of a depth block's output in rematerialisation policies
 MUP_WIDTH = 256  # the public code's base width
 
 
@@ -192,6 +194,8 @@ class DualBlock(nn.Module):
             branch_cache = None if cache is None else cache[branch]
             out[branch], new[branch] = STBlock(cfg, name=branch)(features, start, branch_cache)
         if "depth" in out:
+            # The gradient of W needs it; recomputing it would be all that the depth block's MLP runs again for.
+            out["depth"] = checkpoint_name(out["depth"], DEPTH)
             # Zero at first, so that pre-trained RGB weights keep their logits.
             bf16 = cfg.compute_dtype == "bfloat16"
             project = Dense(cfg.width, bf16, kernel_init=nn.initializers.zeros, name="depth_to_rgb")
@@ -337,7 +341,8 @@ def _rematerialised(config: Architecture) -> Any:
     block = gathers(DualBlock)
     if config.remat == "none":
         return block
-    keep = None if config.remat == "blocks" else jax.checkpoint_policies.save_only_these_names(PRODUCT)
+    names = {"blocks": (DEPTH,), "products": (DEPTH, PRODUCT)}[config.remat]
+    keep = jax.checkpoint_policies.save_only_these_names(*names)
     # Common-subexpression elimination could undo the recomputation within an iteration of the scan, not across
     # iterations.
     return nn.remat(block, prevent_cse=config.unroll > 1, policy=keep)
