@@ -35,7 +35,7 @@ def upgraded(config: dict[str, Any]) -> dict[str, Any]:
     if "mask" in model:
         split_model(model)
     if "use_keypoints" in model.get("loss", {}):
-        choose_keypoints(model["loss"])
+        choose_keypoints(model)
     if "adversarial_weight" in config["tokenizer_train"]:
         split_tokenizer_train(config["tokenizer_train"])
         gather_weights(config["eval"])
@@ -63,7 +63,7 @@ def upgrade_model(model: dict[str, Any]) -> None:
     departures["self_conditioning_after"] = mask.pop("own_frames_after", 0)
     if "loss" in model:
         departures["observed_anchor"] = model["loss"].pop("keypoint_target", "observed") == "observed"
-        departures["masked_keypoints"] = model["loss"].pop("keypoint_masked_only", True)
+        model["loss"].pop("keypoint_masked_only", None)
         departures["visible_keypoints"] = True
     model["departures"] = departures
 
@@ -86,10 +86,12 @@ def split_model(model: dict[str, Any]) -> None:
         del model["loss"]["rgb_weight"]
 
 
-def choose_keypoints(loss: dict[str, Any]) -> None:
-    """Replaces the switch of the keypoint terms by the choice of one."""
+def choose_keypoints(model: dict[str, Any]) -> None:
+    """Replaces the switch of the keypoint terms by the choice of one, and drops what had no effect."""
     words = {True: "printed", False: "none"}
+    loss = model["loss"]
     loss["keypoints"] = words[loss.pop("use_keypoints")]
+    model["departures"].pop("masked_keypoints", None)
 
 
 def split_tokenizer_train(train: dict[str, Any]) -> None:

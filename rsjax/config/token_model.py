@@ -81,8 +81,6 @@ class Departures:
     # The anchor of Eq. 5 is the code of the true first frame, not ŝ₁, the output at frame 1: this is the prompt, which
     # is never masked, so no cross-entropy trains ŝ₁.
     observed_anchor: bool = False
-    # Eq. 5 compares masked cells only: a third to half of ŝ_t lie on visible cells, which are never sampled.
-    masked_keypoints: bool = False
     # M_i, Eq. 5 and Eq. 6 leave out the frames in which a point is hidden or outside the picture.
     visible_keypoints: bool = False
 
@@ -178,6 +176,9 @@ class LossConfig:
     keypoint_weight: float = 0.01  # λ₂
     attention_weight: float = 1.0  # λ₃
     gamma: float = 5.0  # γ of Eq. 6
+    # How Eq. 6 weighs cells. printed: Eq. 7, a second cross-entropy beside L_RGB. normalised: weights of the mean 1 on
+    # the one cross-entropy, whose weight is 1 (rsjax.models.roboscape.departures.normalised_attention).
+    attention: Literal["printed", "normalised"] = "printed"
     # The keypoint term. printed: Eq. 5, whose minimum is not the truth. difference: the change of a point's code from
     # frame to frame (rsjax.models.roboscape.departures.keypoint_difference). none: neither a keypoint term nor Eq. 7.
     keypoints: Literal["none", "printed", "difference"] = "printed"
@@ -298,7 +299,11 @@ class RoboScapeConfig(TokenModelConfig):
     def loss_weights(self) -> dict[str, float]:
         off = set() if self.use_depth else {"depth"}
         off |= {"keypoint", "attention"} if self.loss.keypoints == "none" else set()
-        return {"rgb": 1.0} | {name: weight for name, weight in loss_weights(self.loss).items() if name not in off}
+        weights = {"rgb": 1.0} | {name: x for name, x in loss_weights(self.loss).items() if name not in off}
+        if "attention" in weights and self.loss.attention == "normalised":
+            # It takes the place of L_RGB, which is still logged.
+            return weights | {"rgb": 0.0, "attention": 1.0}
+        return weights
 
 
 @register_family("genie")

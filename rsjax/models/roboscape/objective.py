@@ -19,7 +19,7 @@ from rsjax import clip
 from rsjax.config import RoboScapeConfig, TokenModelConfig
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.departures.keypoint_difference import difference, seen_steps
-from rsjax.models.roboscape.departures.masked_keypoints import compared
+from rsjax.models.roboscape.departures.normalised_attention import normalised
 from rsjax.models.roboscape.departures.observed_anchor import anchor
 from rsjax.models.roboscape.departures.visible_keypoints import counted_frames
 from rsjax.tokenizers import lfq
@@ -69,7 +69,7 @@ def loss_terms(
     mask: Bool[Array, "B T H W"],
     batch: Batch,
 ) -> dict[str, Term]:
-    """Returns (weighted sum, weight) of every term whose weight λ is not 0.
+    """Returns (weighted sum, weight) of every term that is on.
 
     Args:
         logits: of every cell, by branch.
@@ -111,12 +111,15 @@ def loss_terms(
             s = lfq.tokens_to_codes(targets["rgb"], bits).reshape(s_hat.shape)
             distance = difference(jnp.concatenate([first, s_hat[:, 1:]], axis=1), s, cells)
             counts = seen_steps(batch.visible)
-        counts = counts * batch.weight[:, None, None] * compared(departures, mask, cells)[:, 1:]
+        counts = counts * batch.weight[:, None, None]
         terms["keypoint"] = jnp.sum(distance * counts), jnp.sum(counts)
 
         # Eq. 6 and 7: L_Attention = -Σ_t A_t ⊙ s_t log p(ŝ_t). It is divided by the number of cells, not by Σ A.
         attention = attention_map(keypoints, grid, config.loss.gamma)
-        terms["attention"] = jnp.sum(nats * attention * masked), jnp.sum(masked)
+        if config.loss.attention == "printed":
+            terms["attention"] = jnp.sum(nats * attention * masked), jnp.sum(masked)
+        else:
+            terms["attention"] = normalised(nats, attention, masked)
 
     weights = config.loss_weights
     return {name: term for name, term in terms.items() if name in weights}

@@ -8,7 +8,7 @@ import pytest
 from rsjax.config import CorruptionConfig, Departures, SampleConfig, TokenModelConfig, presets
 
 FULL_SIZE = ("roboscape_s", "roboscape_m", "roboscape_l", "genie_35m", "genie_138m", "genie_35m_actions")
-KEYPOINTS = {"observed_anchor": True, "masked_keypoints": True, "visible_keypoints": True}
+KEYPOINTS = {"observed_anchor": True, "visible_keypoints": True}
 TINY = KEYPOINTS | {
     "integrate_actions": True,
     "read_previous": True,

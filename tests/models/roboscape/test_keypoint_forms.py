@@ -9,7 +9,7 @@ import pytest
 
 from rsjax.config import Departures, LossConfig, RoboScapeConfig
 from rsjax.models.roboscape.architecture import Architecture
-from rsjax.models.roboscape.objective import Batch, loss_terms
+from rsjax.models.roboscape.objective import Batch, attention_map, loss_terms, select
 from rsjax.tokenizers import lfq
 from rsjax.trainable import Term
 
@@ -49,9 +49,8 @@ def true_logits() -> np.ndarray:
     return 200 * np.asarray(jax.nn.one_hot(sub_tokens, 8))
 
 
-@pytest.mark.parametrize("masked_only", [False, True])
 @pytest.mark.parametrize("observed", [False, True])
-def test_difference_is_its_equation(observed: bool, masked_only: bool) -> None:
+def test_difference_is_its_equation(observed: bool) -> None:
     s_hat = np.array(lfq.mean_codes(jnp.array(LOGITS), BITS))
     if observed:
         s_hat[:, 0] = TRUE_CODES[:, 0]
@@ -63,14 +62,11 @@ def test_difference_is_its_equation(observed: bool, masked_only: bool) -> None:
                 here = CELLS[clip, i, t]
                 if not (VISIBLE[clip, i, t - 1] and VISIBLE[clip, i, t]):
                     continue
-                if masked_only and not MASK[clip, t].ravel()[here]:
-                    continue
                 predicted = s_hat[clip, t, here] - s_hat[clip, t - 1, before]
                 true = TRUE_CODES[clip, t, here] - TRUE_CODES[clip, t - 1, before]
                 total += np.sum((predicted - true) ** 2)
                 count += 1
-    departures = Departures(observed_anchor=observed, masked_keypoints=masked_only)
-    found = terms("difference", departures=departures)["keypoint"]
+    found = terms("difference", departures=Departures(observed_anchor=observed))["keypoint"]
     np.testing.assert_allclose(found, (total, count), rtol=1e-5)
     assert count > 0
 
@@ -112,3 +108,28 @@ def test_all_tracks_count_whatever_k(keypoints: str) -> None:
     many = terms(keypoints, num_keypoints=TRACKS)
     np.testing.assert_array_equal(few["keypoint"], many["keypoint"])
     assert few["attention"] != many["attention"]
+
+
+def test_normalised_attention_is_a_cross_entropy_whose_weights_have_the_mean_1() -> None:
+    loss = LossConfig(gamma=7.0, num_keypoints=2)
+    points = select(jnp.array(TRACKED), jnp.array(VISIBLE), loss.num_keypoints, GRID)
+    emphasis = np.asarray(attention_map(points, GRID, loss.gamma))
+    nats = np.asarray(lfq.token_cross_entropy(jnp.array(LOGITS), jnp.array(TOKENS), BITS))
+    counted = MASK & (WEIGHT > 0)[:, None, None, None]
+    weights = emphasis[counted] / emphasis[counted].mean()
+    assert len(set(weights.tolist())) == 2
+    departures = Departures(visible_keypoints=True)
+    found = terms("printed", attention="normalised", gamma=7.0, num_keypoints=2, departures=departures)
+    total, weight = found["attention"]
+    np.testing.assert_allclose(total / weight, np.mean(weights * nats[counted]), rtol=1e-5)
+    np.testing.assert_allclose(found["rgb"][0] / found["rgb"][1], np.mean(nats[counted]), rtol=1e-5)
+
+
+def test_a_flat_normalised_attention_is_the_objective_without_attention() -> None:
+    flat = RoboScapeConfig(loss=LossConfig(attention="normalised", gamma=1.0, keypoint_weight=0.0), use_depth=False)
+    without = RoboScapeConfig(loss=LossConfig(attention_weight=0.0, keypoint_weight=0.0), use_depth=False)
+    assert without.loss_weights == {"rgb": 1.0}
+    assert flat.loss_weights == {"rgb": 0.0, "attention": 1.0}
+    found = terms("printed", attention="normalised", gamma=1.0)
+    np.testing.assert_allclose(found["attention"], found["rgb"], rtol=1e-6)
+    assert RoboScapeConfig(loss=LossConfig(attention="normalised", attention_weight=0.0)).loss_weights["rgb"] == 1.0

@@ -66,9 +66,9 @@ _departure(
 )
 _departure(
     "keypoint-anchor",
-    "Eq. 5 pulls towards the code of the true first frame, at masked cells",
+    "Eq. 5 pulls towards the code of the true first frame",
     "The paper's anchor ŝ₁ is the output at the prompt, which no cross-entropy trains.",
-    {"model.departures.observed_anchor": False, "model.departures.masked_keypoints": False},
+    {"model.departures.observed_anchor": False},
     ("delta_psnr_uniform", *_METRICS),
 )
 
