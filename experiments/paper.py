@@ -35,7 +35,7 @@ class Options:
     seeds: int = 3
     """Trainings of each arm."""
     weights: str = ""
-    """A directory with the weights of LPIPS and FVD (docs/evaluation.md); scores that lack theirs are null."""
+    """A directory with the weights of LPIPS and FVD (docs/evaluation.md). Default: the preset's."""
     depth_estimator: str = ""
     """A network that estimates depth (docs/evaluation.md)."""
     dry_run: bool = False

@@ -54,7 +54,7 @@ def debug() -> Config:
         ),
         train=TrainConfig(steps=4, batch_size=2),
         runtime=RuntimeConfig(log_every=2, checkpoint_every=2),
-        eval=EvalConfig(clips=2, batch_size=2, action_draws=1, report_clips=2, localiser_steps=10),
+        eval=EvalConfig(clips=2, batch_size=2, action_draws=1, report_clips=2, localiser_steps=10, weights=""),
     )
 
 

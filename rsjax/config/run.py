@@ -13,6 +13,8 @@ from rsjax.config.token_model import RoboScapeConfig
 from rsjax.config.tokenizer import TokenizerConfig, TokenizerTrainConfig
 from rsjax.config.train import LoopConfig, RuntimeConfig, TrainConfig
 
+WEIGHTS = "weights"  # the directory of metrics' files unless a run names another one
+
 
 @dataclass(frozen=True)
 class EvalConfig:
@@ -25,8 +27,9 @@ class EvalConfig:
     report_clips: int = 4  # clips shown in the report: half typical ones, half the worst
     localiser_steps: int = 500  # training steps of the network that finds cube and gripper in frames
     # A directory with files that are not part of this project: lpips_alex.safetensors and lpips_vgg.safetensors of
-    # python -m experiments.convert lpips, and i3d_torchscript.pt for FVD. Without its file, a metric is null.
-    weights: str = ""
+    # python -m experiments.convert lpips, and i3d_torchscript.pt for FVD. Without its file, a metric is null. Only the
+    # default directory may be missing; "": no files.
+    weights: str = WEIGHTS
     depth_estimator: str = ""  # a network and its files, as in experiments.ingest --depth
 
     def __post_init__(self) -> None:
@@ -46,12 +49,15 @@ class EvalConfig:
         """Returns the path of a metric's file in the directory ``weights``; "" if it is not there.
 
         Raises:
-            ConfigError: the directory is missing.
+            ConfigError: the directory is missing, and not the default one.
         """
         if not self.weights:
             return ""
         directory = Path(self.weights)
-        require(directory.is_dir(), f"eval.weights is {directory}: no such directory; mend the path, or leave it empty")
+        require(
+            directory.is_dir() or self.weights == WEIGHTS,
+            f"eval.weights is {directory}: no such directory; mend the path, or leave it empty",
+        )
         if not (directory / name).exists():
             return ""
         return str(directory / name)

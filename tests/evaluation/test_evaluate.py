@@ -94,7 +94,7 @@ def test_own_actions_in_place_of_random_ones_make_no_difference(clips: Store, mo
     """The sampling key is the same: with the same actions every ΔPSNR is 0, at random draws too."""
     config = replace(
         toy.with_model(toy.config(), sample=SampleConfig(temperature=1.0)),
-        eval=EvalConfig(clips=4, batch_size=4, action_draws=1, report_clips=1),
+        eval=EvalConfig(clips=4, batch_size=4, action_draws=1, report_clips=1, weights=""),
     )
     monkeypatch.setattr(evaluation.delta_psnr, "other_clips", lambda clips, draws, seed: np.arange(clips)[None])
     monkeypatch.setattr(evaluation.delta_psnr, "uniform_actions", lambda own, *_, seed: own[None])

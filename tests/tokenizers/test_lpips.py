@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
+from rsjax.config.run import WEIGHTS
+from rsjax.evaluation.metrics.lpips import FILES, how_to_get
 from rsjax.tokenizers.lpips import NETS, LpipsError, load_lpips, lpips, lpips_shapes, min_size
 
 TAPS = {"alexnet": (0, 3, 6, 8, 10), "vgg16": (2, 7, 14, 21, 28)}
@@ -40,7 +42,7 @@ def by_hand(net: str, params: dict[str, Any], one: np.ndarray, other: np.ndarray
         x = images.transpose(0, 3, 1, 2)
         x = (x - np.reshape([-0.030, -0.088, -0.188], (3, 1, 1))) / np.reshape([0.458, 0.448, 0.450], (3, 1, 1))
         outputs = []
-        for index in map(int, params["backbone"]):
+        for index in sorted(map(int, params["backbone"])):
             if index in POOLED[net]:
                 x = windows(x, POOLED[net][index], 2).max((4, 5))
             layer = params["backbone"][str(index)]
@@ -71,6 +73,18 @@ def test_distances_are_the_definition_s(net: str) -> None:
     assert found.shape == (2,)
     np.testing.assert_allclose(found, by_hand(net, params, *pair()), rtol=1e-3)
     np.testing.assert_allclose(distance(params, *pair()[::-1]), found, rtol=1e-5)
+
+
+@pytest.mark.parametrize("net", NETS)
+def test_published_weights_give_the_definition_s_distances(net: str) -> None:
+    path = Path(WEIGHTS) / FILES[net]
+    if not path.exists():
+        pytest.skip(f"no {path}: {how_to_get(net)}")
+    params = load_lpips(path, net)
+    assert all(np.all(head["weight"] >= 0) for head in params["head"].values())  # as they are trained
+    one, other = pair()
+    exact = by_hand(net, jax.tree.map(np.float64, params), one.astype(np.float64), other.astype(np.float64))
+    np.testing.assert_allclose(distance(params, one, other), exact, rtol=0, atol=1e-6)
 
 
 def test_images_are_no_distance_from_themselves_and_batches_keep_their_shape() -> None:

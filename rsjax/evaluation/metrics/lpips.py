@@ -53,27 +53,49 @@ def check_lpips(settings: EvalConfig) -> None:
             load_lpips(path, net)
 
 
+def advice(settings: EvalConfig) -> str:
+    """Returns a line on how to get LPIPS; "" if a file is there, or ``eval.weights`` is empty."""
+    if not settings.weights or any(settings.weights_file(name) for name in FILES.values()):
+        return ""
+    return f"no LPIPS, as {settings.weights} has no weights: {how_to_get('alexnet')} gets them (64 MB; docs/convert.md)"
+
+
+def how_to_get(net: str) -> str:
+    """Returns the command that makes a network's file in the default directory."""
+    word = FILES[net].removeprefix("lpips_").removesuffix(".safetensors")
+    return f"python -m experiments.convert lpips --net {word}"
+
+
 def _frames(scene: Scene, net: str) -> PerFrame:
     path = scene.settings.weights_file(FILES[net])
     if not path:
-        made = f"python -m experiments.convert lpips IN DIR/{FILES[net]}"
-        raise Unavailable(f"no {FILES[net]} in eval.weights: {made}, then --eval.weights DIR")
+        raise Unavailable(f"no {FILES[net]} in eval.weights: {how_to_get(net)}")
     params = load_lpips(path, net)
     side = min(scene.truth.rgb.shape[2:4])
     if side < min_size(params):
         raise Unavailable(f"frames of {side} pixels; LPIPS with {net} needs {min_size(params)}")
-    pairs = zip(scene.truth.rgb, scene.prediction.rgb, strict=True)
-    return np.stack([distances(params, *pair) for pair in pairs])[:, scene.prompt_frames :]
+    truth = scene.truth.rgb[:, scene.prompt_frames :]
+    prediction = scene.prediction.rgb[:, scene.prompt_frames :]
+    scores = distances(params, truth.reshape(-1, *truth.shape[2:]), prediction.reshape(-1, *truth.shape[2:]))
+    return scores.reshape(truth.shape[:2])
+
+
+def distances(
+    params: dict[str, Any], truth: UInt8[Array, "N H W 3"], prediction: UInt8[Array, "N H W 3"]
+) -> Float[np.ndarray, " N"]:
+    """Returns the LPIPS of each pair of frames, in float32 on every device; values 0–255."""
+    scores = []
+    # A loop in Python, since convolutions in one of JAX take ten times as long on a CPU.
+    for start in range(0, len(truth), _PAIRS):
+        rows = np.minimum(np.arange(start, start + _PAIRS), len(truth) - 1)  # repeats the last pair to a full batch
+        scores.append(distances_of_batch(params, truth[rows], prediction[rows]))
+    return np.concatenate(scores)[: len(truth)]
 
 
 @jax.jit
-def distances(
-    params: dict[str, Any], truth: UInt8[Array, "T H W 3"], prediction: UInt8[Array, "T H W 3"]
-) -> Float[Array, " T"]:
-    """Returns the LPIPS of each frame, in float32 on every device; values 0–255."""
-
-    def distance(pair: tuple[Array, Array]) -> Array:
-        return lpips(params, *(frame.astype(np.float32) / 127.5 - 1 for frame in pair))
-
+def distances_of_batch(
+    params: dict[str, Any], truth: UInt8[Array, "N H W 3"], prediction: UInt8[Array, "N H W 3"]
+) -> Float[Array, " N"]:
+    """Returns the LPIPS of each pair of frames, all computed at once."""
     with jax.default_matmul_precision("highest"):
-        return jax.lax.map(distance, (truth, prediction), batch_size=_PAIRS)
+        return lpips(params, *(frames.astype(np.float32) / 127.5 - 1 for frames in (truth, prediction)))

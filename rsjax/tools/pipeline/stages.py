@@ -9,6 +9,7 @@ from rsjax.data.curriculum import LoaderFactory, check_stages, loader_factory
 from rsjax.data.normalization import Normalization
 from rsjax.data.quarantine import NAME as QUARANTINE
 from rsjax.data.store import Store
+from rsjax.evaluation.metrics.lpips import advice
 from rsjax.evaluation.results import save_evaluation
 from rsjax.files import disk_guard
 from rsjax.models.base import Assets, create_autoencoder, create_model
@@ -108,7 +109,9 @@ def check_before_start(run: Run) -> None:
 
 
 def note_changes(run: Run, command: str) -> None:
-    """Records this start in ``run.json``, and says what has changed since the last one."""
+    """Records this start in ``run.json``; says what has changed since the last one, and how to get missing weights."""
+    if not run.finished("evaluation") and (line := advice(run.config.eval)):
+        note(line)
     changed = " and ".join(record_start(run, command))
     if changed and not all(run.finished(name) for name in TRAINED if name in run.stages):
         note(f"since the last start {changed} changed (run.json); results may differ from those of one unbroken run")
@@ -142,7 +145,7 @@ def train_tokenizer(run: Run, resume: bool) -> None:
     cfg = run.config
     train = cfg.tokenizer_train
     if train.lpips_missing:
-        note("the LPIPS term is off: tokenizer_train.perceptual.lpips is empty (docs/tokenizer.md says how to make it)")
+        note("the LPIPS term is off: tokenizer_train.perceptual.lpips is empty (docs/tokenizer.md says how to get it)")
     # Checks the world model's curriculum and clips before the tokenizer is trained.
     for store in check_stages(cfg.train, run.open_clips()):
         create_model(cfg).check_clips(store)

@@ -88,7 +88,7 @@ def test_clips_that_are_too_short_have_a_reason(network: Path) -> None:
 def test_without_network_or_torch_there_is_a_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / FILE).write_bytes(b"")
     with pytest.raises(Unavailable, match=r"no i3d_torchscript.pt in eval.weights"):
-        score("fvd", scene(EvalConfig()))
+        score("fvd", scene(EvalConfig(weights="")))
     monkeypatch.setattr("rsjax.evaluation.metrics.fvd.find_spec", lambda name: None)
     with pytest.raises(Unavailable, match="FVD needs PyTorch: pip install"):
         score("fvd", scene(EvalConfig(weights=str(tmp_path))))

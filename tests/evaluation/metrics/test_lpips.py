@@ -7,9 +7,9 @@ from safetensors.numpy import load_file, save_file
 from rsjax.clip import Video
 from rsjax.config import ConfigError, EvalConfig
 from rsjax.evaluation.evaluate import check_files
-from rsjax.evaluation.metrics.lpips import FILES
+from rsjax.evaluation.metrics.lpips import FILES, advice, distances
 from rsjax.evaluation.registry import Scene, Unavailable, metrics
-from rsjax.tokenizers.lpips import LpipsError, lpips_shapes
+from rsjax.tokenizers.lpips import LpipsError, load_lpips, lpips_shapes
 
 METRICS = {"alexnet": "lpips_alex", "vgg16": "lpips_vgg"}
 
@@ -87,8 +87,10 @@ def test_the_metric_is_the_public_definition_over_predicted_frames(net: str, fil
 def test_without_weights_or_room_there_is_a_reason_and_no_number(net: str, files: dict[str, Path]) -> None:
     function = metrics()[METRICS[net]].function
     assert function is not None
-    with pytest.raises(Unavailable, match=rf"^no {FILES[net]} in eval.weights: python -m experiments.convert lpips"):
-        function(scene(EvalConfig()))
+    with pytest.raises(
+        Unavailable, match=rf"^no {FILES[net]} in eval.weights: python -m experiments.convert lpips --net"
+    ):
+        function(scene(EvalConfig(weights="")))
     with pytest.raises(Unavailable, match=f"frames of 15 pixels; LPIPS with {net} needs"):
         function(scene(EvalConfig(weights=str(files[net].parent)), side=15))
 
@@ -103,3 +105,19 @@ def test_a_missing_directory_or_a_file_of_the_other_network_is_refused_at_the_st
         check_files(EvalConfig(weights=str(tmp_path)))
     with pytest.raises(ConfigError, match="eval.weights is nowhere: no such directory"):
         check_files(EvalConfig(weights="nowhere"))
+
+
+def test_advice_is_given_until_a_file_is_there(files: dict[str, Path], tmp_path: Path) -> None:
+    assert advice(EvalConfig(weights="")) == ""
+    assert advice(EvalConfig(weights=str(files["alexnet"].parent))) == ""
+    line = advice(EvalConfig(weights=str(tmp_path)))
+    assert "python -m experiments.convert lpips --net alex gets them" in line
+    assert len(line.splitlines()) == 1
+
+
+def test_batches_of_any_size_have_the_distances_of_single_pairs(files: dict[str, Path]) -> None:
+    params = load_lpips(files["alexnet"])
+    truth, prediction = (np.random.default_rng(seed).integers(0, 256, (11, 32, 34, 3), np.uint8) for seed in (0, 1))
+    together = distances(params, truth, prediction)
+    alone = [distances(params, truth[i : i + 1], prediction[i : i + 1])[0] for i in range(11)]
+    np.testing.assert_allclose(together, alone, rtol=1e-5)

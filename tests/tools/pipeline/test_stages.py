@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from rsjax.config import AdversarialConfig, LoopConfig, PerceptualConfig, TokenizerTrainConfig
+from rsjax.config.config_fields import with_values
 from rsjax.data.store import write_store
 from rsjax.models.load_run import load_tokenizer
 from rsjax.models.roboscape.model import RoboScape
@@ -88,3 +89,13 @@ def test_changed_code_is_noted_for_a_family_without_a_tokenizer_too(
     monkeypatch.setattr(stages, "record_start", lambda run, command: ["the code"])
     stages.note_changes(run, "")
     assert "since the last start the code changed" in capsys.readouterr().out
+
+
+def test_a_start_says_how_to_get_lpips_where_its_weights_may_come(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for weights, said in (("weights", 1), ("", 0)):
+        config = with_values(toy.config(), {"eval.weights": weights})
+        stages.note_changes(Run(config, tmp_path / "run", tmp_path), "")
+        assert capsys.readouterr().out.count("experiments.convert lpips --net alex gets them") == said
