@@ -1,0 +1,86 @@
+"""Trains with features in bf16, as accelerators do, and with those of a CPU, in float32: are the losses alike?
+
+``python -m benchmarks.number_formats RUN DATA`` (a finished run of ``tiny`` and its ``--data-dir``, both left alone)
+trains ``tiny``'s tokenizer, ``tiny``, and ``roboscape_s`` with 4 blocks of width 128 for 100 steps each, with three
+seeds, and prints the mean loss of the last 20 steps as a table. A CPU has no bf16 products in either case but those of
+its own, so this is about rounding, not about speed.
+"""
+
+import sys
+import tempfile
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import numpy as np
+
+from rsjax.config import AdamW, Config, RoboScapeConfig
+from rsjax.models.base import create_autoencoder, create_model
+from rsjax.models.load_run import load_config
+from rsjax.runtime import tune_process
+from rsjax.tools.pipeline.run import Run
+from rsjax.tools.pipeline.stages import tokenizer_loader, world_model_loader
+from rsjax.training.log import read_log
+from rsjax.training.loop import fit
+
+STEPS = 100
+LAST = 20
+SEEDS = (0, 1, 2)
+DOORS = ("rsjax.models.roboscape.transformer.in_feature_dtype", "rsjax.tokenizers.magvit2.in_feature_dtype")
+
+
+def small_roboscape(config: Config) -> Config:
+    """Returns the paper's objective and optimizer at the size of ``tiny``."""
+    model = RoboScapeConfig(width=128, blocks=4, heads=4, compute_dtype="bfloat16")
+    return replace(config, model=model, train=replace(config.train, optimizer=AdamW(learning_rate=1e-3), accumulate=1))
+
+
+TRAININGS: dict[str, tuple[str, Callable[[Config], Config]]] = {
+    "tokenizer of tiny": ("tokenizer", lambda config: config),
+    "tiny": ("world_model", lambda config: config),
+    "roboscape_s, 4 blocks of width 128": ("world_model", small_roboscape),
+}
+
+
+def last_loss(run: Run, part: str, seed: int, dtype: str) -> float:
+    """Returns the mean loss of a training's last steps, with features between layers in this number format."""
+
+    def in_this_dtype(_: str, network: Callable[[str], Any]) -> Any:
+        return network(dtype)
+
+    cfg = run.config
+    create = {"tokenizer": create_autoencoder, "world_model": create_model}[part]
+    loader = {"tokenizer": tokenizer_loader, "world_model": world_model_loader}[part](run)
+    loop = replace(loader.loop, steps=STEPS, seed=seed, log_every=1, checkpoint_every=0, eval_every=0)
+    loader = replace(loader, loop=loop)
+    with ExitStack() as stack:
+        for door in DOORS:
+            stack.enter_context(mock.patch(door, in_this_dtype))
+        directory = stack.enter_context(tempfile.TemporaryDirectory())
+        fit(create(cfg), loop, loader, Path(directory), name=f"{part} {dtype} {seed}")
+        return float(np.mean([row["loss"] for row in read_log(Path(directory))[-LAST:]]))
+
+
+def main() -> None:
+    """Prints the table."""
+    tune_process()
+    directory = Path(sys.argv[1])
+    config = load_config(directory)
+    print("| loss | seed | float32 features | bf16 features | difference |\n|---|---|---|---|---|", flush=True)
+    for name, (part, change) in TRAININGS.items():
+        run = Run(change(config), directory, Path(sys.argv[2]))
+        losses = []
+        for seed in SEEDS:
+            pair = [last_loss(run, part, seed, dtype) for dtype in ("float32", "bfloat16")]
+            losses.append(pair)
+            print(f"| {name} | {seed} | {pair[0]:.4f} | {pair[1]:.4f} | {pair[1] - pair[0]:+.4f} |", flush=True)
+        spread = np.std([pair[0] for pair in losses], ddof=1)
+        apart = np.mean([pair[1] - pair[0] for pair in losses])
+        print(f"| {name} | deviation of seeds {spread:.4f} | | | mean {apart:+.4f} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
