@@ -158,7 +158,7 @@ def parse(text: str) -> Module:
                 current = computations.setdefault(header[2], Computation(header[2]))
                 if header[1]:
                     entry = current.name
-        elif line == "}":
+        elif line.startswith("}"):  # an execution thread may follow
             current = None
         else:
             start = _INSTRUCTION.match(line)

@@ -30,8 +30,15 @@ FREE_CALLS = {
     "AllocateBuffer", "AssumeGatherIndicesInBound", "GatherScatterIndicesBitpacked", "ConcatBitcast", "Sharding",
     "SPMDFullToShardShape", "SPMDShardToFullShape", "annotate_device_placement",
 }  # fmt: skip
-# Custom calls that only move data, or whose operations are few beside their bytes.
-PLAIN_CALLS = {"TopK", "__cub$DeviceRadixSort", "xla.gpu.ext.cub_sort_unassigned_scratch_size", "__gpu$TopK"}
+# Custom calls that only move data, or whose operations are few beside their bytes. The one without a name is a gather
+# that a TPU's SparseCore does.
+PLAIN_CALLS = {
+    "TopK",
+    "__cub$DeviceRadixSort",
+    "xla.gpu.ext.cub_sort_unassigned_scratch_size",
+    "__gpu$TopK",
+    "TODO(b/522284627)",
+}
 COLLECTIVES = ("all-reduce", "all-gather", "reduce-scatter", "all-to-all", "collective-permute", "ragged-all-to-all")
 # Names in an operation's path that are no module of the model.
 _WRAPPERS = {

@@ -41,6 +41,16 @@ def test_the_figures_of_a_step_are_written_and_shown(tmp_path: Path) -> None:
     assert "not a measurement" in done.stdout and "ENTRY" in dump.read_text()
 
 
+def test_a_tpu_s_program_with_fused_collectives_is_costed(tmp_path: Path) -> None:
+    out = tmp_path / "numbers.json"
+    line = f"debug --target v5p-8 --train.batch-size 8 --runtime.sharding mesh --runtime.fsdp 4 --json {out}"
+    done = run("experiments.compile", *line.split())
+    assert done.returncode == 0, done.stderr
+    numbers = json.loads(out.read_text())
+    assert numbers["devices"] == 4 and numbers["collectives"] and not numbers["warnings"]
+    assert 0 < numbers["roofline_mfu"] < 1
+
+
 @pytest.mark.parametrize(
     ("line", "words"),
     [

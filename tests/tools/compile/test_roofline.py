@@ -182,6 +182,24 @@ def test_arrays_on_a_tpus_chip_cost_nothing_and_those_in_memory_their_padding() 
     assert [kernel.bytes for kernel in moved.kernels] == [2 * 8 * 128, 2 * 8 * 128]
 
 
+def test_a_computation_of_another_thread_ends_like_any() -> None:
+    gather = """
+%gather (x: f32[10]) -> f32[10] {
+  %x = f32[10]{0} parameter(0)
+  ROOT %y = f32[10]{0} custom-call(%x), custom_call_target="TODO(b/522284627)"
+}, execution_thread="sparsecore"
+
+%other (x: f32[10]) -> f32[10] {
+  ROOT %x = f32[10]{0} parameter(0)
+}
+"""
+    entry = """%v = f32[10]{0} parameter(0)
+    %start = ((f32[10]{0}), f32[10]{0}, u32[]) async-start(%v), async_execution_thread="sparsecore", calls=%gather
+    ROOT %done = f32[10]{0} async-done(%start)"""
+    moved = cost(entry, gather, card=TPU)
+    assert moved.bytes == 80 and not moved.warnings
+
+
 def test_a_condition_costs_its_longer_branch() -> None:
     branches = """
 %short (x: f32[10]) -> f32[10] {
