@@ -1,4 +1,4 @@
-"""Runs a grid and compares it. ``python -m experiments.ablation tiny --grid model.use_depth=True,False``"""
+"""Runs a grid and compares it. ``python -m experiments.ablation tiny --grid model.depth=branch,head,none``"""
 
 import os
 import shlex
@@ -30,7 +30,7 @@ class Options:
     data_dir: Path = Path("data")
     """Directory of simulated data sets, which runs share."""
     only: tuple[str, ...] = ()
-    """Cells to run, by name or shell pattern ('model.use_depth=True,*'). Default: all."""
+    """Cells to run, by name or shell pattern ('model.depth=head,*'). Default: all."""
     skip: tuple[str, ...] = ()
     """Cells to leave out, by name or shell pattern."""
     cell: int | None = None

@@ -32,7 +32,6 @@ FIRST_FIELDS = {
     "tokenizer-train.optimizer.learning-rate": "Peak learning rate of the tokenizer.",
     "model.width": "Channels of the world model.",
     "model.blocks": "Transformer blocks of the world model.",
-    "model.use-depth": "Whether the model has a depth branch.",
     "model.action-encoder": "How the model reads actions.",
     "train.steps": "Training steps of the world model.",
     "train.curriculum": "A curriculum: a file with a JSON list of stages, or the list (docs/training.md); []: none.",

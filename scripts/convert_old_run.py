@@ -41,6 +41,8 @@ def upgraded(config: dict[str, Any]) -> dict[str, Any]:
         gather_weights(config["eval"])
         for section in ("tokenizer_train", "train"):
             split_optimizer(config[section]["optimizer"])
+    if "use_depth" in model:
+        model["depth"] = {"kind": "branch" if model.pop("use_depth") else "none"}
     return config
 
 

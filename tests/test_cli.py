@@ -120,7 +120,7 @@ def test_a_section_is_chosen_by_a_word_and_switched_on_by_a_field_of_its_own() -
             "invalid choice 'worst' for argument '--model.sample.unmask'. Expected one of ('random', 'greedy')",
         ),
         (["tiny", "--sim.frames", "99", "--model.max-frames", "16"], "99 frames but model.max_frames is 16"),
-        (["genie_35m", "--model.use-depth", "True"], "unknown argument '--model.use-depth'"),
+        (["genie_35m", "--model.depth", "head"], "unknown argument '--model.depth'"),
         (["debug", "--model", "genie", "--model.loss.gamma", "2"], "unknown argument '--model.loss.gamma'"),
         (["tiny", "--model.corruption", "0.1"], "--model.corruption is '0.1'; choose on or off"),
         (["tiny", "--model.corruption"], "--model.corruption is ''; choose on or off"),

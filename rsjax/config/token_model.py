@@ -279,17 +279,41 @@ class TokenModelConfig(TransformerConfig, ModelConfig):
         check_sampling(self.sample, self.frames(clips), self.departures.action_dropout)
 
 
+@dataclass(frozen=True)
+class DepthBranch:
+    """The paper's way: a second branch of blocks predicts depth (Eq. 2), and its features join RGB's (Eq. 3)."""
+
+    kind: ClassVar[Literal["branch"]] = "branch"
+
+
+@dataclass(frozen=True)
+class DepthHead:
+    """Depth tokens are embedded beside RGB's in one branch of blocks, and a second head on its output predicts them.
+
+    This is multi-task learning without Eq. 3. It costs two embeddings and a head, under 1 % of the operations.
+    """
+
+    kind: ClassVar[Literal["head"]] = "head"
+
+
+@dataclass(frozen=True)
+class NoDepth:
+    """The model neither reads nor predicts depth."""
+
+    kind: ClassVar[Literal["none"]] = "none"
+
+
 @register_family("roboscape")
 @dataclass(frozen=True)
 class RoboScapeConfig(TokenModelConfig):
     """RoboScape: the dual-branch transformer with the physics-informed objective (paper §2.3)."""
 
-    use_depth: bool = True  # False: without the depth branch, its projections and the depth term
+    depth: DepthBranch | DepthHead | NoDepth = DepthBranch()  # how depth is used
     loss: LossConfig = LossConfig()  # λ₁, λ₂, λ₃ and γ
 
     @property
     def uses_depth(self) -> bool:
-        return self.use_depth
+        return not isinstance(self.depth, NoDepth)
 
     @property
     def marked_keypoints(self) -> int:
@@ -297,7 +321,7 @@ class RoboScapeConfig(TokenModelConfig):
 
     @property
     def loss_weights(self) -> dict[str, float]:
-        off = set() if self.use_depth else {"depth"}
+        off = set() if self.uses_depth else {"depth"}
         off |= {"keypoint", "attention"} if self.loss.keypoints == "none" else set()
         weights = {"rgb": 1.0} | {name: x for name, x in loss_weights(self.loss).items() if name not in off}
         if "attention" in weights and self.loss.attention == "normalised":

@@ -279,7 +279,7 @@ def test_the_schedule_of_a_loop_restarts_within_its_steps_in_their_order() -> No
 def test_the_paper_s_loss_weights() -> None:
     model = c.RoboScapeConfig()
     assert model.loss_weights == {"rgb": 1.0, "depth": 1.0, "keypoint": 0.01, "attention": 1.0}
-    assert c.RoboScapeConfig(use_depth=False).loss_weights == {"rgb": 1.0, "keypoint": 0.01, "attention": 1.0}
+    assert c.RoboScapeConfig(depth=c.NoDepth()).loss_weights == {"rgb": 1.0, "keypoint": 0.01, "attention": 1.0}
     assert model.loss.gamma == 5.0
     assert c.GenieConfig().loss_weights == {"rgb": 1.0}
 

@@ -26,7 +26,7 @@ def test_config_fields_are_the_configurations_json_by_dotted_names() -> None:
     for name, field in known.items():
         if not field.section:
             assert saved[name] == (list(field.value) if isinstance(field.value, tuple) else field.value)
-    classes = {"model.family", "train.optimizer.kind", "tokenizer_train.optimizer.kind"}
+    classes = {"model.family", "train.optimizer.kind", "tokenizer_train.optimizer.kind", "model.depth.kind"}
     assert set(saved) - set(known) == classes
     assert known["runtime.log_every"].runtime
     assert not known["train.steps"].runtime
@@ -39,7 +39,6 @@ def test_config_fields_are_the_configurations_json_by_dotted_names() -> None:
             "prompt_frames": st.integers(1, 5),
             "model.loss.gamma": st.floats(0, 100),
             "model.loss.depth_weight": st.floats(0, 10),
-            "model.use_depth": st.booleans(),
             "train.optimizer.learning_rate": st.floats(1e-6, 1),
             "train.seed": st.integers(0, 2**31),
             "model.sample.unmask": st.sampled_from(["random", "greedy"]),

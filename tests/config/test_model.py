@@ -11,9 +11,12 @@ from rsjax.config import (
     ConfigError,
     CorruptionConfig,
     Departures,
+    DepthBranch,
+    DepthHead,
     GenieConfig,
     LossConfig,
     ModelConfig,
+    NoDepth,
     PublicCodeConfig,
     RoboScapeConfig,
     SampleConfig,
@@ -26,7 +29,7 @@ from rsjax.config import (
 
 DEBUG = presets.debug()
 CHANGED = (
-    RoboScapeConfig(width=32, use_depth=False, loss=LossConfig(gamma=2.0), corruption=None, max_frames=9),
+    RoboScapeConfig(width=32, depth=NoDepth(), loss=LossConfig(gamma=2.0), corruption=None, max_frames=9),
     RoboScapeConfig(corruption=CorruptionConfig(probability=0.1), public_code=PublicCodeConfig(qk_norm=True)),
     GenieConfig(action_encoder="none", heads=2, sample=SampleConfig(steps=3, cache_dtype="bfloat16")),
 )
@@ -50,12 +53,12 @@ def test_every_family_survives_json(model: ModelConfig) -> None:
 def test_a_family_keeps_changed_fields_and_its_own_defaults_for_the_others() -> None:
     corruption, sample = CorruptionConfig(random_token_rate=0.1), SampleConfig(steps=5)
     shared: dict[str, Any] = {"width": 64, "heads": 4, "corruption": corruption, "sample": sample}
-    config = replace(DEBUG, model=RoboScapeConfig(use_depth=False, **shared))
+    config = replace(DEBUG, model=RoboScapeConfig(depth=DepthHead(), **shared))
     genie = config.with_family("genie")
     assert genie == replace(config, model=GenieConfig(**shared))
     # The action encoder is at RoboScape's default, so it becomes Genie's; set on purpose, it is kept.
     assert (RoboScapeConfig().action_encoder, GenieConfig().action_encoder) == ("linear", "mlp")
-    assert genie.with_family("roboscape") == replace(config, model=replace(config.model, use_depth=True))  # type: ignore[call-arg]
+    assert genie.with_family("roboscape") == replace(config, model=replace(config.model, depth=DepthBranch()))  # type: ignore[call-arg]
     without = replace(config, model=GenieConfig(width=64, heads=4, action_encoder="none"))
     assert without.with_family("roboscape").model == RoboScapeConfig(width=64, heads=4, action_encoder="none")
 
@@ -96,8 +99,8 @@ def test_a_file_without_a_family_is_refused() -> None:
 
 def test_a_field_of_another_family_is_refused_by_name() -> None:
     values = to_dict(replace(DEBUG, model=GenieConfig()))
-    values["model"]["use_depth"] = True
-    with pytest.raises(ConfigError, match="GenieConfig has no field use_depth"):
+    values["model"]["depth"] = {"kind": "head"}
+    with pytest.raises(ConfigError, match="GenieConfig has no field depth"):
         as_read(values)
 
 

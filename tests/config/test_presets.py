@@ -38,7 +38,8 @@ def test_full_size_presets_are_the_papers_setting(name: str) -> None:
     assert (network.frames, network.blocks) == (16, 32)
     dual = name.startswith("roboscape")
     assert isinstance(config.model, RoboScapeConfig if dual else GenieConfig)
-    assert network.use_depth == config.model.uses_depth == dual
+    assert network.depth == ("branch" if dual else "none")
+    assert config.model.uses_depth == dual
     assert (network.action_inputs > 0) == (dual or name.endswith("actions"))
 
 

@@ -3,6 +3,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from rsjax.config import NoDepth
 from rsjax.evaluation import evaluate as evaluation
 from rsjax.evaluation.depth_estimator import DepthEstimator, DepthMaps, estimate_depth
 from tests.tools.pipeline import toy
@@ -48,7 +49,7 @@ def test_a_model_without_depth_on_clips_without_depth_has_the_estimators_scores(
     estimator: DepthEstimator, tmp_path: Path
 ) -> None:
     blind = toy.store(tmp_path / "clips", depth=False)
-    trained = toy.trained(blind, toy.with_model(toy.config(), use_depth=False))
+    trained = toy.trained(blind, toy.with_model(toy.config(), depth=NoDepth()))
     found = evaluation.evaluate(trained, blind, estimator=estimator)
     depth = {name: value for name, value in found.metrics.items() if "depth" in name}
     assert {name.rpartition("_estimator")[0] for name in depth} == {

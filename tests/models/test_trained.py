@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rsjax.clip import Video
-from rsjax.config import SampleConfig
+from rsjax.config import NoDepth, SampleConfig
 from rsjax.data.store import Store
 from rsjax.errors import UserError
 from rsjax.models.roboscape.model import RoboScape
@@ -37,7 +37,7 @@ def trained(request: pytest.FixtureRequest, clips: Store, model: TrainedModel) -
     """With depth and decoded greedily; or without depth and with random draws."""
     if request.param == "depth":
         return model
-    return toy.trained(clips, toy.with_model(CONFIG, use_depth=False, sample=SampleConfig(temperature=1.0)))
+    return toy.trained(clips, toy.with_model(CONFIG, depth=NoDepth(), sample=SampleConfig(temperature=1.0)))
 
 
 RNG = np.random.default_rng(0)

@@ -51,7 +51,7 @@ def test_every_parameter_belongs_to_one_part() -> None:
 
 
 def test_one_branch_is_the_model_without_depth() -> None:
-    alone = with_values(DEBUG, {"model.use_depth": False})
+    alone = with_values(DEBUG, {"model.depth": "none"})
     assert described(DEBUG).figures["params_one_branch"] == described(alone).figures["params_world_model"]
 
 
@@ -125,7 +125,7 @@ def test_the_terminal_shows_every_module_and_figure() -> None:
 def test_the_command_prints_figures_as_json_with_overrides_applied(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("sys.argv", ["describe", "debug", "--json", "--model.use-depth", "False"])
+    monkeypatch.setattr("sys.argv", ["describe", "debug", "--json", "--model.depth", "none"])
     command.main()
     printed = json.loads(capsys.readouterr().out)
-    assert printed == {"preset": "debug"} | described(with_values(DEBUG, {"model.use_depth": False})).figures
+    assert printed == {"preset": "debug"} | described(with_values(DEBUG, {"model.depth": "none"})).figures

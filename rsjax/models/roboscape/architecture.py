@@ -5,6 +5,9 @@ from typing import Literal
 
 from rsjax.config import (
     Config,
+    DepthBranch,
+    DepthHead,
+    NoDepth,
     RoboScapeConfig,
     SampleConfig,
     TokenModelConfig,
@@ -23,7 +26,8 @@ class Architecture(TransformerConfig):
         grid: token cells along each side of a frame.
         code_bits: bits of a token, in ``vocabularies`` equal parts.
         action_inputs: numbers per frame that the action encoder reads; 0: no encoder.
-        use_depth: whether the network has a depth branch.
+        depth: how the network uses depth: in a branch of its own (Eq. 2 and 3), by a second head on the RGB branch, or
+            not at all.
         feature_dtype: of the features between layers; :func:`rsjax.models.roboscape.transformer.run_transformer` sets
             it.
     """
@@ -33,7 +37,7 @@ class Architecture(TransformerConfig):
     code_bits: int = 18
     vocabularies: int = 2
     action_inputs: int = 28
-    use_depth: bool = True
+    depth: Literal["branch", "head", "none"] = "branch"
     feature_dtype: Literal["float32", "bfloat16"] = "float32"
 
     @classmethod
@@ -42,6 +46,9 @@ class Architecture(TransformerConfig):
         model = config.model
         clips = config.clips
         assert isinstance(model, TokenModelConfig)
+        depth: DepthBranch | DepthHead | NoDepth = NoDepth()
+        if isinstance(model, RoboScapeConfig):
+            depth = model.depth
         inputs = 0
         if model.action_encoder != "none":
             inputs = action_inputs(model.departures, clips.action_dim)
@@ -52,7 +59,7 @@ class Architecture(TransformerConfig):
             code_bits=config.tokenizer.code_bits,
             vocabularies=config.tokenizer.vocabularies,
             action_inputs=inputs,
-            use_depth=isinstance(model, RoboScapeConfig) and model.use_depth,
+            depth=depth.kind,
         )
 
     @property
@@ -61,9 +68,16 @@ class Architecture(TransformerConfig):
         return 2 ** (self.code_bits // self.vocabularies)
 
     @property
+    def modalities(self) -> tuple[str, ...]:
+        """Names of what the network reads and predicts."""
+        if self.depth == "none":
+            return ("rgb",)
+        return ("rgb", "depth")
+
+    @property
     def branches(self) -> tuple[str, ...]:
-        """Names of the network's branches."""
-        if self.use_depth:
+        """Names of the network's branches, which are the modalities that have blocks of their own."""
+        if self.depth == "branch":
             return ("rgb", "depth")
         return ("rgb",)
 

@@ -51,7 +51,7 @@ class TokenBranching:
     """Implements :class:`rsjax.models.branch_states.Branching`.
 
     Args:
-        has_depth: whether the clips have depth; otherwise a depth branch sees it masked.
+        has_depth: whether the clips have depth; otherwise a model that uses depth sees it masked.
         lanes: clips in a pass.
     """
 
@@ -70,7 +70,7 @@ class TokenBranching:
         self._arch = arch
         self._codec = codec
         self._params = params
-        self._has_depth = arch.use_depth and has_depth and codec.normalization.depth_range is not None
+        self._has_depth = arch.depth != "none" and has_depth and codec.normalization.depth_range is not None
         # First states are on the parameters' devices, as are those that passes return, so that one program takes both.
         where = getattr(jax.tree.leaves(params)[0], "sharding", None) or jax.local_devices()[0]
         self._place = partial(jax.device_put, device=where)
@@ -79,7 +79,7 @@ class TokenBranching:
         video = first if self._has_depth else Video(first.rgb)
         grids = self._codec.encode(video)
         cells = {branch: jnp.asarray(grid.reshape(1, 1, -1), jnp.int32) for branch, grid in grids.items()}
-        if self._arch.use_depth:
+        if self._arch.depth != "none":
             cells.setdefault("depth", jnp.zeros_like(cells["rgb"]))
         state = replace(self._start(self._sample(Decoding(steps=1)), cells), cache={})
         sums = np.zeros(len(self._codec.normalization.action_mean))
@@ -161,14 +161,14 @@ class TokenBranching:
 
     def _start(self, sample: SampleConfig, tokens: dict[str, Int[Array, "1 1 S"]]) -> State:
         """Returns the state of one clip after its first frame."""
-        hidden = jnp.ones(1, bool) if self._arch.use_depth and not self._has_depth else None
+        hidden = jnp.ones(1, bool) if self._arch.depth != "none" and not self._has_depth else None
         actions = jnp.zeros((1, 1, self._arch.action_inputs))
         state: State = self._place(_start(self._arch, sample, self._params, tokens, actions, None, hidden))
         return state
 
     def _branch_state(self, memory: _Memory, rgb: UInt8[np.ndarray, "H W 3"]) -> BranchState:
         state = memory.state
-        branches = self._arch.branches if self._has_depth else ("rgb",)
+        branches = self._arch.modalities if self._has_depth else ("rgb",)
         tokens = {branch: np.asarray(state.tokens[branch][0, -1]) for branch in branches}
         means = {branch: np.asarray(cells[0, -1]) for branch, cells in state.means.items() if branch in branches}
         assert state.entropy is not None

@@ -10,18 +10,18 @@ from rsjax.models.roboscape.architecture import Architecture
 
 
 def forward_flops(config: Architecture, frames: int) -> int:
-    """Returns the operations of one pass over one clip of ``frames`` frames, all branches, without a cache.
+    """Returns the operations of one pass over one clip of ``frames`` frames, all modalities, without a cache.
 
     Temporal attention counts every pair of frames, though half of the pairs are masked.
     """
     cells = config.grid**2
     width = config.width
-    branches = 2 if config.use_depth else 1
     linear = 8 * width**2 + 2 * config.public.mlp_ratio * width**2  # qkv and proj of both attentions, fc1 and fc2
     attention = 2 * (cells + frames) * width  # scores and weighted sums, over space and over time
     head = width * config.vocabularies * config.vocabulary_size
-    joint = width**2 * config.blocks if config.use_depth else 0  # depth → RGB
-    per_cell = branches * (config.blocks * (linear + attention) + head) + joint
+    per_cell = len(config.branches) * config.blocks * (linear + attention) + len(config.modalities) * head
+    if config.depth == "branch":
+        per_cell += width**2 * config.blocks  # W of Eq. 3
     encoder = config.action_inputs * width
     if config.action_inputs and config.action_encoder == "mlp":
         encoder += width**2

@@ -35,7 +35,7 @@ class TokenImagination:
         self._arch = arch
         self._codec = codec
         self._params = params
-        self._has_depth = arch.use_depth and codec.normalization.depth_range is not None
+        self._has_depth = arch.depth != "none" and codec.normalization.depth_range is not None
         self._state: State | None = None
         self._sums = np.zeros((clips, len(codec.normalization.action_mean)))
 
@@ -45,11 +45,11 @@ class TokenImagination:
         rows = np.zeros(len(which), int)  # of all clips; those that go on take any
         rows[which] = np.arange(len(first))
         tokens = {name: jnp.asarray(grid.reshape(len(first), 1, -1)[rows]) for name, grid in grids.items()}
-        if self._arch.use_depth:
+        if self._arch.depth != "none":
             tokens.setdefault("depth", jnp.zeros_like(tokens["rgb"]))
         keys = jax.vmap(partial(jax.random.fold_in, jax.random.key(self._config.sample.seed)))(jnp.asarray(index)[rows])
         hidden = None
-        if self._arch.use_depth and not self._has_depth:
+        if self._arch.depth != "none" and not self._has_depth:
             hidden = jnp.ones(len(which), bool)
         fresh = _start(self._arch, self._config.sample, self._params, tokens, keys, hidden)
         if self._state is None:

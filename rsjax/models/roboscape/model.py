@@ -76,7 +76,7 @@ class RoboScape(WorldModel[Batch]):
         """
         arch = self.architecture
         departures = self.config.departures
-        targets = {branch: getattr(batch, branch) for branch in arch.branches}
+        targets = {branch: getattr(batch, branch) for branch in arch.modalities}
         corrupted = masking.corrupt(
             self.config.corruption,
             departures.visible_prefix,
@@ -184,7 +184,7 @@ class RoboScape(WorldModel[Batch]):
         """Predicts each frame from the true frames before it. T may exceed the trained positions."""
         arch = self.architecture
         tokens, has_depth = self._tokens(assets, video)
-        if arch.use_depth and "depth" not in tokens:
+        if "depth" in arch.modalities and "depth" not in tokens:
             tokens["depth"] = jnp.zeros_like(tokens["rgb"])
         tokens, inputs = divide((tokens, self._action_inputs(assets, actions)), params)
         return score_tokens(arch, self.config.sample, params, tokens, inputs, ~has_depth, prompt_frames)
@@ -208,7 +208,7 @@ class RoboScape(WorldModel[Batch]):
 
     def _tokens(self, assets: Assets, video: Video) -> tuple[Tokens, np.ndarray]:
         """Returns a video's tokens by branch (depth if the model and a clip have it), and which clips have depth."""
-        seen = video if self.architecture.use_depth else Video(video.rgb)
+        seen = video if self.config.uses_depth else Video(video.rgb)
         return {branch: jnp.asarray(grid) for branch, grid in self._codec(assets).encode(seen).items()}, seen.has_depth
 
     def _action_inputs(self, assets: Assets, actions: Float[np.ndarray, "B T A"]) -> Float[Array, "B T A2"]:

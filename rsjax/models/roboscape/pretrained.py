@@ -22,8 +22,11 @@ from rsjax.trainable import Params
 
 # Departures in which the saved network and the one to train must agree; other departures may differ.
 ALIKE = {"read_previous", "whole_frames", "rotary", "more_norms"}
+# Parameters whose outputs are added to the RGB branch's features; and those of a model with a depth head.
+JOINING: tuple[str, ...] = ("blocks/depth_to_rgb/", "action_encoder/", "action_encoder_fc2/", "null_action")
+HEAD_JOINING = ("depth_embed/", "depth_previous_embed/")
 # Fields that may differ.
-FREE = {"use_depth", "action_encoder", "action_inputs", "departures"} | {
+FREE = {"action_encoder", "action_inputs", "departures"} | {
     "compute_dtype",
     "feature_dtype",
     *(field.name for field in fields(TransformerConfig) if field.metadata.get("runtime")),
@@ -65,6 +68,8 @@ def shapes(own: Architecture, directory: Path) -> Params:
     if saved.action_inputs:
         free = FREE - {"action_encoder"}
         alike = ALIKE | {"integrate_actions"}
+    if saved.depth == "none":
+        free = free | {"depth"}
     other = {field.name for field in fields(Departures)} - alike
     differing = "; ".join(
         filter(None, [differences(saved, own, free), differences(saved.departures, own.departures, other)])
@@ -77,8 +82,9 @@ def shapes(own: Architecture, directory: Path) -> Params:
 def start(fresh: Params, saved: Params, directory: Path) -> Params:
     """Returns the parameters that training begins with: the saved ones, unchanged, completed by fresh ones.
 
-    The depth → RGB projection and the action encoder's last layer begin at zero, so that RGB logits are at first those
-    of the saved model. A saved action encoder is kept; it reads actions normalised for the new data.
+    What joins the RGB branch begins at zero: the depth → RGB projection or, with a depth head, the embeddings of depth,
+    and the action encoder's last layer. So RGB logits are at first those of the saved model. A saved action encoder is
+    kept; it reads actions normalised for the new data.
 
     Raises:
         UserError: this model lacks a saved array, or has it in another shape.
@@ -90,11 +96,10 @@ def start(fresh: Params, saved: Params, directory: Path) -> Params:
             raise UserError(f"{directory}: its {path} has no place in this model; keep the branches and the actions")
         if params[path].shape != own[path].shape:
             raise UserError(f"{directory}: its {path} is {params[path].shape}, this model's is {own[path].shape}")
+    joining = JOINING
+    if not any(path.startswith("blocks/depth/") for path in own):
+        joining += HEAD_JOINING
     for path, x in own.items():
         if path not in params:
-            params[path] = jnp.zeros_like(x) if _joins_rgb(path) else x
+            params[path] = jnp.zeros_like(x) if path.startswith(joining) else x
     return unflatten_dict(params, sep="/")
-
-
-def _joins_rgb(path: str) -> bool:
-    return path.startswith(("blocks/depth_to_rgb/", "action_encoder/", "action_encoder_fc2/", "null_action"))

@@ -342,7 +342,7 @@ def rollout(
     multiple of ``arch.frames``.
 
     Args:
-        prompt: the tokens of P frames by branch. If "depth" is missing for a model with that branch, no clip has depth.
+        prompt: the tokens of P frames by branch. If "depth" is missing for a model that uses it, no clip has depth.
         actions: of all T frames, normalised; row t led into frame t, row 0 is not read.
         key: of the random draws; the draws do not depend on actions.
         cached: False recomputes all frames of the window in every pass, for comparison.
@@ -450,9 +450,9 @@ def _cache_settings(arch: Architecture, sample: SampleConfig) -> tuple[tuple[str
 def _prompt_tokens(
     arch: Architecture, prompt: Tokens, no_depth: Any
 ) -> tuple[dict[str, Int[Array, "B P S"]], Array | None]:
-    """Checks and returns the prompt's tokens of the model's branches, and ``no_depth`` if the model needs it."""
+    """Checks and returns the prompt's tokens of the model's modalities, and ``no_depth`` if the model needs it."""
     cells = {branch: jnp.asarray(grid, jnp.int32).reshape(*grid.shape[:2], -1) for branch, grid in prompt.items()}
-    if not arch.use_depth:
+    if arch.depth == "none":
         return {"rgb": cells["rgb"]}, None
     clips = len(cells["rgb"])
     if no_depth is not None and np.shape(no_depth) != (clips,):
@@ -460,7 +460,7 @@ def _prompt_tokens(
     if "depth" in cells:
         if isinstance(no_depth, np.ndarray) and not no_depth.any():  # the program without it is smaller
             no_depth = None
-        return {branch: cells[branch] for branch in arch.branches}, no_depth
+        return {name: cells[name] for name in arch.modalities}, no_depth
     if no_depth is not None and not np.all(no_depth):
         raise ValueError('no_depth says that clips have depth, but the prompt has no tokens "depth"')
     return cells | {"depth": jnp.zeros_like(cells["rgb"])}, jnp.ones(clips, bool)

@@ -78,7 +78,7 @@ def _score_window(
 ) -> tuple[Scores, Scores]:
     """Returns cross-entropy and accuracy of each frame's tokens by branch; frame 0 is predicted from none."""
     clips, frames = actions.shape[:2]
-    transformer = partial(run_transformer, arch, params, no_depth=no_depth if arch.use_depth else None)
+    transformer = partial(run_transformer, arch, params, no_depth=no_depth)
     visible = jnp.zeros((clips, frames, arch.grid, arch.grid), bool)
     empty = empty_cache(arch, clips, cache_slots(arch, frames + arch.uncommitted))
     _, cache = transformer(tokens, visible, actions, 0, empty)

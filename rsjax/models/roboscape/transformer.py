@@ -204,7 +204,11 @@ class DualBlock(nn.Module):
 
 
 class Transformer(nn.Module):
-    """Two branches of spatial-temporal blocks, or the RGB branch alone if ``config.use_depth`` is False."""
+    """Two branches of spatial-temporal blocks (``config.depth`` "branch"), or the RGB branch alone.
+
+    With ``config.depth`` "head" the RGB branch also reads depth tokens, and a second head on its output predicts them.
+    Its modalities, what it reads and predicts, are "rgb" and "depth", or "rgb" alone.
+    """
 
     config: Architecture
 
@@ -220,24 +224,23 @@ class Transformer(nn.Module):
         no_depth: Bool[Array, " B"] | None = None,
         previous: dict[str, Cells] | None = None,
     ) -> tuple[dict[str, Float[Array, "B T S n V"]], Cache | None]:
-        """Returns logits of every cell of frames start … start + T - 1 by branch, and the cache.
+        """Returns logits of every cell of frames start … start + T - 1 by modality, and the cache.
 
         Args:
-            tokens: by branch ("rgb", and "depth" if the model has it), or codes; ignored where ``mask`` is True.
-            mask: True for masked cells, in both branches; ``whole_frames`` masks more, see
+            tokens: by modality, or codes; ignored where ``mask`` is True.
+            mask: True for masked cells, in both modalities; ``whole_frames`` masks more, see
                 :mod:`rsjax.models.roboscape.departures.whole_frames`.
             actions: row t led into frame start + t; ignored if ``config.action_inputs`` is 0.
             start: position of the first of these frames; may be traced. For learned positions a traced start + T must
                 not exceed ``config.frames``, which is not checked.
             cache: from :func:`empty_cache` or an earlier call; frames before ``start`` are read from it.
             drop_actions: True for clips that see the null action instead of their own; needs ``action_dropout``.
-            no_depth: True for clips without depth: all their cells are masked in the depth branch. Ignored by a model
-                without that branch.
-            previous: for ``read_previous``, tokens of the frame before each of these, by branch; those for frame
+            no_depth: True for clips without depth: all their depth cells are masked. Ignored by a model without depth.
+            previous: for ``read_previous``, tokens of the frame before each of these, by modality; those for frame
                 0 are not read. If ``start`` is 0, the default is ``tokens`` moved by one frame.
 
         Returns:
-            float32 logits by branch, and the cache with these frames written in (None without a cache).
+            float32 logits by modality, and the cache with these frames written in (None without a cache).
 
         Raises:
             ValueError: actions are missing; ``drop_actions`` is passed to a model without a null action; the model has
@@ -250,23 +253,25 @@ class Transformer(nn.Module):
         if departures.read_previous and previous is None and not (isinstance(start, int) and start == 0):
             raise ValueError("the model reads the frame before these, which do not begin a clip: pass previous")
         b, t = mask.shape[:2]
-        cells = {name: tokens[name].reshape(b, t, cfg.grid**2, *tokens[name].shape[4:]) for name in cfg.branches}
+        cells = {name: tokens[name].reshape(b, t, cfg.grid**2, *tokens[name].shape[4:]) for name in cfg.modalities}
 
         # Eq. 2: the sum of token, action and position embeddings, by branch.
         shared = self._positions(t, start)
         if cfg.action_inputs:
             shared = shared + self._action(actions, drop_actions)
         mask = hidden(departures, mask.reshape(b, t, cfg.grid**2), start)
-        masks = dict.fromkeys(cfg.branches, mask)
-        if cfg.use_depth and no_depth is not None:
+        masks = dict.fromkeys(cfg.modalities, mask)
+        if "depth" in masks and no_depth is not None:
             masks["depth"] = mask | no_depth[:, None, None]
-        x = {name: TokenEmbed(cfg, name=f"{name}_embed")(cells[name], masks[name]) + shared for name in cfg.branches}
+        x = {name: TokenEmbed(cfg, name=f"{name}_embed")(cells[name], masks[name]) for name in cfg.modalities}
+        x |= {branch: x[branch] + shared for branch in cfg.branches}
         if departures.read_previous:
-            previous = previous or {branch: frame_before(frames) for branch, frames in cells.items()}
-            for branch, before in previous.items():
-                absent = absent_cells(branch, before, start, no_depth)
-                x[branch] = x[branch] + TokenEmbed(cfg, name=f"{branch}_previous_embed")(before, absent)
-
+            previous = previous or {name: frame_before(frames) for name, frames in cells.items()}
+            for name, before in previous.items():
+                absent = absent_cells(name, before, start, no_depth)
+                x[name] = x[name] + TokenEmbed(cfg, name=f"{name}_previous_embed")(before, absent)
+        if cfg.depth == "head":
+            x = {"rgb": x["rgb"] + x["depth"]}
         x = {branch: features.astype(cfg.feature_dtype) for branch, features in x.items()}
 
         # Both branches' blocks, with Eq. 3 after each pair.
@@ -282,7 +287,7 @@ class Transformer(nn.Module):
         x, new = blocks(cfg, name="blocks")(x, together(cache), start)
         if cache is not None:
             cache = put_frames(cache, new, start, departures.rotary)
-        return {branch: self._head(branch, features) for branch, features in x.items()}, cache
+        return {name: self._head(name, x.get(name, x["rgb"])) for name in cfg.modalities}, cache
 
     def _positions(self, frames: int, start: Any) -> Float[Array, "T S C"]:
         """Returns the embeddings of frames and cells, or with rotary positions those of cells alone, (1, S, C)."""
@@ -311,13 +316,13 @@ class Transformer(nn.Module):
             encoded = with_null_action(encoded, null, drop)
         return encoded[:, :, None]
 
-    def _head(self, branch: str, x: Float[Array, "B T S C"]) -> Float[Array, "B T S n V"]:
+    def _head(self, modality: str, x: Float[Array, "B T S C"]) -> Float[Array, "B T S n V"]:
         cfg = self.config
-        x = optional_norm(cfg.departures.more_norms, f"{branch}_norm_out", x)
+        x = optional_norm(cfg.departures.more_norms, f"{modality}_norm_out", x)
         if cfg.public.mup:
             x = x / (cfg.width / MUP_WIDTH)
         bf16 = cfg.compute_dtype == "bfloat16"
-        logits = Dense(cfg.vocabularies * cfg.vocabulary_size, bf16, name=f"{branch}_head")(x)
+        logits = Dense(cfg.vocabularies * cfg.vocabulary_size, bf16, name=f"{modality}_head")(x)
         return logits.astype(jnp.float32).reshape(*x.shape[:-1], cfg.vocabularies, cfg.vocabulary_size)
 
     def init_params(self, key: Array) -> Params:
@@ -325,7 +330,7 @@ class Transformer(nn.Module):
         cfg = self.config
         tokens = jnp.zeros((1, 1, cfg.grid, cfg.grid), jnp.int32)
         actions = jnp.zeros((1, 1, cfg.action_inputs))
-        return self.init(key, dict.fromkeys(cfg.branches, tokens), tokens == 0, actions)["params"]
+        return self.init(key, dict.fromkeys(cfg.modalities, tokens), tokens == 0, actions)["params"]
 
 
 def run_transformer(arch: Architecture, params: Params, *inputs: Any, **options: Any) -> Any:

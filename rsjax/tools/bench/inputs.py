@@ -69,11 +69,11 @@ def batch_shapes(model: WorldModel[Any], config: Config) -> Any:
 
 
 def prompt(arch: Architecture, size: int, frames: int) -> dict[str, Int[Array, "B T H W"]]:
-    """Returns random tokens of ``frames`` prompt frames for each branch."""
-    keys = jax.random.split(jax.random.key(0), len(arch.branches))
+    """Returns random tokens of ``frames`` prompt frames for each modality."""
+    keys = jax.random.split(jax.random.key(0), len(arch.modalities))
     shape = (size, frames, arch.grid, arch.grid)
     drawn = (jax.random.randint(key, shape, 0, 2**arch.code_bits, "int32") for key in keys)
-    return dict(zip(arch.branches, drawn, strict=True))
+    return dict(zip(arch.modalities, drawn, strict=True))
 
 
 def actions(arch: Architecture, size: int, frames: int) -> Float[Array, "B T A"]:

@@ -100,7 +100,7 @@ def train(config: Config, batch: int, budget: float) -> Numbers:
         "parameters": sum(x.size for x in jax.tree.leaves(state.params)),
     }
     if isinstance(model, RoboScape):
-        tokens = batch * config.clips.frames * config.grid**2 * len(model.architecture.branches)
+        tokens = batch * config.clips.frames * config.grid**2 * len(model.architecture.modalities)
         numbers["train_tokens_per_s"] = tokens / seconds
     if flops := batch * model.flops(config.clips.frames).get("train", 0):
         numbers |= {"train_step_flops": flops, "train_flops": flops / seconds}

@@ -118,8 +118,8 @@ def operations(arch: Architecture, config: Config, batch: int) -> tuple[Operatio
     bf16 = arch.compute_dtype == "bfloat16"
     norms = blocks * (4 if arch.public.qk_norm else 2)
     if arch.departures.more_norms:
-        norms += blocks + len(arch.branches)
-    joint = arch.blocks if arch.use_depth else 0  # depth → RGB
+        norms += blocks + len(arch.modalities)
+    joint = arch.blocks if arch.depth == "branch" else 0  # depth → RGB
 
     def product(name: str, times: int, inputs: int, outputs: int) -> Operation:
         layer = Dense(outputs, bf16, use_bias=False)
@@ -139,13 +139,13 @@ def operations(arch: Architecture, config: Config, batch: int) -> tuple[Operatio
         product("projection", 2 * blocks + joint, width, width),
         product("mlp_in", blocks, width, hidden),
         product("mlp_out", blocks, hidden, width),
-        product("head", len(arch.branches), width, arch.vocabularies * arch.vocabulary_size),
+        product("head", len(arch.modalities), width, arch.vocabularies * arch.vocabulary_size),
         attention("attention_in_frames", partial(attend_cells, bf16=bf16), frames, cells),
         attention("attention_over_time", partial(_causal, frames), cells, frames),
         Operation("gelu", blocks, gelu, ((rows, hidden),)),
         Operation("norm", norms, norm, ((rows, width), (width,), (width,))),
         Operation("residual_sum", 3 * blocks + joint, jnp.add, ((rows, width),) * 2, passes_on=True),
-        Operation("loss", len(arch.branches), _cross_entropy, (vocabulary,)),
+        Operation("loss", len(arch.modalities), _cross_entropy, (vocabulary,)),
     )
 
 

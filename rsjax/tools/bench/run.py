@@ -11,13 +11,14 @@ import jax
 from rich.table import Table
 
 from rsjax.config import Config, require
+from rsjax.config.config_fields import config_fields
 from rsjax.errors import did_you_mean
 from rsjax.tools.bench import inputs, parts
 from rsjax.tools.bench.roofline import roofline
 from rsjax.tools.bench.timing import peak_memory_bytes
 
 PARTS = ("matmul", "train", "roofline", "sample", "tokenizer", "environment", "loader", "feed")
-MODEL_FACTS = ("blocks", "width", "use_depth", "compute_dtype", "remat")  # reported if the family has them
+MODEL_FACTS = ("blocks", "width", "depth", "compute_dtype", "remat")  # reported if the family has them
 Rival = Callable[[Config, int, float, int], dict[str, Any]]  # of configuration, batch, seconds, frames of a rollout
 BUDGET_SECONDS = 20.0  # per quantity, unless three runs take longer
 
@@ -161,12 +162,13 @@ def facts(config: Config, batch: int) -> dict[str, Any]:
     name = device.device_kind
     if device.platform == "cpu":
         name = _cpu_model()
+    model = config_fields(config.model)
     return {
         "preset": config.name,
         "batch": batch,
         "model": config.model.family,
         "frames": config.clips.frames,
-        **{name: getattr(config.model, name) for name in MODEL_FACTS if hasattr(config.model, name)},
+        **{name: model[name].value for name in MODEL_FACTS if name in model},
         "device": name,
         "platform": device.platform,
         "cores": len(os.sched_getaffinity(0)),

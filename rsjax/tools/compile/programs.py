@@ -165,7 +165,7 @@ def frame(config: Config, device: Any, clips: int) -> Program:
     sample = dataclasses.replace(model.config.sample, seed=0)
 
     def first(params: Any) -> Any:
-        tokens = dict.fromkeys(arch.branches, jnp.zeros((clips, PROMPT_FRAMES, config.grid**2), jnp.int32))
+        tokens = dict.fromkeys(arch.modalities, jnp.zeros((clips, PROMPT_FRAMES, config.grid**2), jnp.int32))
         actions = jnp.zeros((clips, PROMPT_FRAMES, arch.action_inputs))
         state = start(arch, sample, params, tokens, actions, jax.random.split(jax.random.key(0), clips), None)
         cache = apart(state.cache, arch.blocks, arch.unroll)

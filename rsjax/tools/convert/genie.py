@@ -149,7 +149,7 @@ def infer_config(
             width=width,
             blocks=blocks,
             heads=heads,
-            use_depth=False,
+            depth="none",
             public_code=None if public == PublicCodeConfig() else public,
         )
     except ConfigError as error:

@@ -132,8 +132,8 @@ def collect_clips(run: Run) -> None:
     if cfg.data is not None:
         if cfg.model.uses_depth and not run.open_clips().manifest.get("depth_range"):
             note(
-                "no clip has depth, so the depth branch trains with its loss masked; "
-                "--model.use-depth False trains without it in half the time"
+                "no clip has depth, so depth trains with its loss masked; "
+                "--model.depth none trains without it in half the time"
             )
         return
     with Progress("collect", cfg.sim.episodes, "episodes") as progress:

@@ -14,7 +14,7 @@ from rsjax.tools.bench.run import bench
 
 def toy(**model: Any) -> Config:
     """A model small enough to be measured in no time, with other fields of its settings as given."""
-    settings = {"width": 16, "blocks": 1, "use_depth": False} | model
+    settings = {"width": 16, "blocks": 1, "depth": "none"} | model
     return with_values(presets.get("debug"), {f"model.{name}": value for name, value in settings.items()})
 
 

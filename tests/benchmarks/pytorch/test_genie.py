@@ -24,7 +24,7 @@ TOY = Architecture(
     width=24,
     blocks=2,
     heads=3,
-    use_depth=False,
+    depth="none",
     departures=Departures(embedding_std=0.5),
 )
 

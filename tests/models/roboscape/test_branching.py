@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rsjax.clip import Video
-from rsjax.config import SampleConfig
+from rsjax.config import DepthHead, SampleConfig
 from rsjax.data.store import Store
 from rsjax.models.base import create_model
 from rsjax.models.branch_states import Branching, BranchState, Decoding
@@ -58,7 +58,11 @@ def assert_same(one: BranchState, other: BranchState) -> None:
         np.testing.assert_array_equal(cells, other.tokens[name])
 
 
-def test_frames_are_those_of_generate(lanes: Branching, model: TrainedModel, clips: Store) -> None:
+@pytest.mark.parametrize("way", ["branch", "head"])
+def test_frames_are_those_of_generate(way: str, model: TrainedModel, clips: Store) -> None:
+    if way == "head":
+        model = toy.trained(clips, toy.with_model(model.config, depth=DepthHead()))
+    lanes = model.model.branching(model.params, model.assets, True, lanes=2)
     actions, clip = rows(1), clips.source("test")[1]
     made = alone(lanes, lanes.begin(first(clips, 1)), actions[1:], replace(DRAWN, draw=0))
     video = model.generate(clip["rgb"][:1], actions, clip["depth"][:1])

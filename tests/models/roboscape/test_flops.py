@@ -26,7 +26,7 @@ def world_model(config: Architecture) -> tuple[Any, Any, Any]:
         mask = tokens["rgb"] == 0
         return Transformer(config).apply({"params": params}, tokens, mask, actions)[0]
 
-    return logits, params, (dict.fromkeys(config.branches, grid), actions)
+    return logits, params, (dict.fromkeys(config.modalities, grid), actions)
 
 
 def xla_flops(function: Any, *inputs: Any) -> float:
@@ -38,10 +38,11 @@ def xla_flops(function: Any, *inputs: Any) -> float:
     "config",
     [
         DUAL,
-        replace(DUAL, use_depth=False, action_inputs=0),
+        replace(DUAL, depth="head"),
+        replace(DUAL, depth="none", action_inputs=0),
         replace(DUAL, public_code=NARROW, vocabularies=1),
     ],
-    ids=["dual", "genie", "other shapes"],
+    ids=["dual", "head", "genie", "other shapes"],
 )
 def test_a_pass_of_the_world_model_is_the_formula_to_the_letter(config: Architecture) -> None:
     logits, params, inputs = world_model(config)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rsjax.config import Config, CorruptionConfig, GenieConfig, LossConfig, RoboScapeConfig, presets
+from rsjax.config import Config, CorruptionConfig, GenieConfig, LossConfig, NoDepth, RoboScapeConfig, presets
 from rsjax.models.base import create_model
 from rsjax.models.genie.model import Genie
 from rsjax.models.roboscape.architecture import Architecture
@@ -82,7 +82,7 @@ def test_its_parameters_and_loss_are_those_of_the_rgb_branch(encoder: Any) -> No
     small: dict[str, Any] = {"width": 8, "blocks": 1, "heads": 2, "corruption": corruption, "action_encoder": encoder}
     genie = create_model(debug(GenieConfig(**small)))
     loss = LossConfig(keypoints="none")
-    alone = create_model(debug(RoboScapeConfig(use_depth=False, loss=loss, **small)))
+    alone = create_model(debug(RoboScapeConfig(depth=NoDepth(), loss=loss, **small)))
     assert (type(genie), type(alone)) == (Genie, RoboScape)
     assert genie.loss_weights == alone.loss_weights == {"rgb": 1.0}
     shapes, expected = (jax.eval_shape(model.init, jax.random.key(0)) for model in (genie, alone))

@@ -7,14 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rsjax.config import Departures, LossConfig, RoboScapeConfig
+from rsjax.config import Departures, LossConfig, NoDepth, RoboScapeConfig
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.objective import Batch, attention_map, loss_terms, select
 from rsjax.tokenizers import lfq
 from rsjax.trainable import Term
 
 B, T, GRID, BITS, TRACKS = 3, 4, 3, 6, 5
-ARCHITECTURE = Architecture(frames=T, grid=GRID, code_bits=BITS, vocabularies=2, action_inputs=1, use_depth=False)
+ARCHITECTURE = Architecture(frames=T, grid=GRID, code_bits=BITS, vocabularies=2, action_inputs=1, depth="none")
 RNG = np.random.default_rng(0)
 LOGITS = RNG.normal(scale=3, size=(B, T, GRID**2, 2, 8)).astype(np.float32)
 TOKENS = RNG.integers(0, 2**BITS, (B, T, GRID, GRID), np.int32)
@@ -36,7 +36,7 @@ def terms(
 ) -> dict[str, Term]:
     """The terms of the objective with this keypoint term."""
     loss = LossConfig(keypoints=keypoints, **settings)
-    config = RoboScapeConfig(use_depth=False, loss=loss, departures=departures)
+    config = RoboScapeConfig(depth=NoDepth(), loss=loss, departures=departures)
     tokens = jnp.array(TOKENS)
     still = jnp.zeros((B, T, 1))
     batch = Batch(tokens, tokens, still, jnp.array(tracks), jnp.array(visible), jnp.array(WEIGHT), jnp.arange(B))
@@ -126,8 +126,8 @@ def test_normalised_attention_is_a_cross_entropy_whose_weights_have_the_mean_1()
 
 
 def test_a_flat_normalised_attention_is_the_objective_without_attention() -> None:
-    flat = RoboScapeConfig(loss=LossConfig(attention="normalised", gamma=1.0, keypoint_weight=0.0), use_depth=False)
-    without = RoboScapeConfig(loss=LossConfig(attention_weight=0.0, keypoint_weight=0.0), use_depth=False)
+    flat = RoboScapeConfig(loss=LossConfig(attention="normalised", gamma=1.0, keypoint_weight=0.0), depth=NoDepth())
+    without = RoboScapeConfig(loss=LossConfig(attention_weight=0.0, keypoint_weight=0.0), depth=NoDepth())
     assert without.loss_weights == {"rgb": 1.0}
     assert flat.loss_weights == {"rgb": 0.0, "attention": 1.0}
     found = terms("printed", attention="normalised", gamma=1.0)

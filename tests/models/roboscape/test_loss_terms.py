@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from rsjax.config import CorruptionConfig, Departures, LossConfig, RoboScapeConfig
+from rsjax.config.config_fields import with_values
 from rsjax.models.roboscape import masking
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.departures.action_dropout import dropped_actions
@@ -26,8 +27,8 @@ KEY, CONTEXT = jax.random.key(3), StepContext(jnp.int32(0), None, None)
 
 def model_of(architecture: Architecture, loss: LossConfig) -> RoboScape:
     departures = architecture.departures
-    config = RoboScapeConfig(use_depth=architecture.use_depth, departures=departures, loss=loss, corruption=CORRUPTION)
-    return roboscape(architecture, config)
+    config = RoboScapeConfig(departures=departures, loss=loss, corruption=CORRUPTION)
+    return roboscape(architecture, with_values(config, {"depth": architecture.depth}))
 
 
 @partial(jax.jit, static_argnums=(0, 1))
@@ -56,31 +57,35 @@ def random_batch(clips: int = 3) -> Batch:
     return Batch(**fields)
 
 
-@pytest.mark.parametrize("depth", [True, False])
+@pytest.mark.parametrize("depth", ["branch", "head", "none"])
 @pytest.mark.parametrize("keypoints", ["none", "printed", "difference"])
-def test_what_is_off_has_no_term(depth: bool, keypoints: Any) -> None:
-    model = replace(MODEL, use_depth=depth)
+def test_what_is_off_has_no_term(depth: Any, keypoints: Any) -> None:
+    model = replace(MODEL, depth=depth)
     loss = replace(LOSS, keypoints=keypoints)
     shapes = jax.eval_shape(Transformer(model).init_params, KEY)
     terms = jax.eval_shape(partial(terms_of, model, loss), shapes, random_batch())
     assert terms.keys() == model_of(model, loss).loss_weights.keys()
-    assert ("depth" in terms, "keypoint" in terms, "attention" in terms) == (depth, *2 * [keypoints != "none"])
+    assert ("depth" in terms) == (depth != "none")
+    assert ("keypoint" in terms) == ("attention" in terms) == (keypoints != "none")
 
 
+@pytest.mark.parametrize("model", [MODEL, replace(MODEL, depth="head")], ids=["branch", "head"])
 @pytest.mark.parametrize("has_depth", [None, (1, 0, 1), (0, 0, 0)])
-def test_each_branch_is_scored_on_its_own_clean_tokens_where_masked(has_depth: tuple[int, ...] | None) -> None:
+def test_each_modality_is_scored_on_its_own_clean_tokens_where_masked(
+    has_depth: tuple[int, ...] | None, model: Architecture
+) -> None:
     """Of clips without depth RGB alone, by a model to which all their depth is hidden."""
-    params, batch = random_params(MODEL), random_batch()
+    params, batch = random_params(model), random_batch()
     has = np.ones(3, np.float32) if has_depth is None else np.array(has_depth, np.float32)
     batch = batch.replace(has_depth=None if has_depth is None else has)  # type: ignore[attr-defined]
-    clean = {name: jnp.asarray(getattr(batch, name)) for name in MODEL.branches}
-    corrupt = jax.jit(partial(masking.corrupt, CORRUPTION, 0.0, 1, MODEL.code_bits, MODEL.vocabularies))
+    clean = {name: jnp.asarray(getattr(batch, name)) for name in model.modalities}
+    corrupt = jax.jit(partial(masking.corrupt, CORRUPTION, 0.0, 1, model.code_bits, model.vocabularies))
     given = corrupt(KEY, clean, batch.index)
     inputs = (given.tokens, given.mask, batch.actions)
-    logits, _ = jax.jit(Transformer(MODEL).apply)({"params": params}, *inputs, no_depth=has == 0)
+    logits, _ = jax.jit(Transformer(model).apply)({"params": params}, *inputs, no_depth=has == 0)
     counted = counted_frames(Departures(), batch.visible)
-    points = select(batch.tracks, counted, LOSS.num_keypoints, MODEL.grid)
-    emphasis = np.asarray(attention_map(points, MODEL.grid, LOSS.gamma))
+    points = select(batch.tracks, counted, LOSS.num_keypoints, model.grid)
+    emphasis = np.asarray(attention_map(points, model.grid, LOSS.gamma))
 
     expected = dict.fromkeys(("rgb", "depth", "attention"), 0.0)
     cells = dict.fromkeys(expected, 0)
@@ -100,7 +105,7 @@ def test_each_branch_is_scored_on_its_own_clean_tokens_where_masked(has_depth: t
                 expected["attention"] += score * emphasis[clip, t, row, column]
                 cells["attention"] += 1
 
-    terms = terms_of(MODEL, LOSS, params, batch)
+    terms = terms_of(model, LOSS, params, batch)
     for name, value in expected.items():
         np.testing.assert_allclose(terms[name], (value, cells[name]), rtol=1e-4, err_msg=name)
 

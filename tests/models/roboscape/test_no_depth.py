@@ -12,7 +12,7 @@ from rsjax.models.roboscape import sample as module
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.sample import encode_prompt, rollout, rollout_from
 from tests.models.roboscape.toy import blind, depart
-from tests.models.roboscape.toy_sample import DUAL, KEY, RGB, given, random_params
+from tests.models.roboscape.toy_sample import DUAL, HEAD, KEY, RGB, given, random_params
 
 CLIPS = 3
 SOME = np.array([False, True, False])
@@ -21,9 +21,10 @@ WARM = SampleConfig(steps=2, temperature=1.0, window_stride=2)
 GUIDED = depart(DUAL, action_dropout=0.2, rotary=True, read_previous=True)
 # Few, and shared by all tests here: compiling is most of the work.
 WINDOW = (DUAL, WARM, 2, 12)
+ONE_TRUNK = (HEAD, WARM, 2, 12)
 ROTARY = (GUIDED, replace(WARM, guidance=2.0, unmask="greedy"), 8, 11)
 WAYS = pytest.mark.parametrize(
-    ("model", "sample", "prompt", "frames"), [WINDOW, ROTARY], ids=["window", "guided-rotary-greedy"]
+    ("model", "sample", "prompt", "frames"), [WINDOW, ONE_TRUNK, ROTARY], ids=["window", "head", "guided-rotary-greedy"]
 )
 
 
@@ -51,8 +52,9 @@ def test_cached_is_uncached_and_a_clip_is_as_it_is_among_its_like(
     assert not np.array_equal(mixed["rgb"][SOME], make(None)["rgb"][SOME]), "depth is of no use to this model"
 
 
-def test_a_clip_without_depth_is_that_of_a_model_which_is_blind_to_depth_tokens() -> None:
-    model, sample, prompt, frames = WINDOW
+@pytest.mark.parametrize("way", [WINDOW, ONE_TRUNK], ids=["branch", "head"])
+def test_a_clip_without_depth_is_that_of_a_model_which_is_blind_to_depth_tokens(way: Any) -> None:
+    model, sample, prompt, frames = way
     params, (tokens, actions) = random_params(model), given(model, prompt, frames, CLIPS)
     hidden = rollout(model, sample, params, tokens, actions, KEY, no_depth=SOME)["rgb"]
     unseen = rollout(model, sample, blind(params), tokens, actions, KEY)["rgb"]
@@ -105,7 +107,7 @@ def test_where_all_clips_have_depth_it_is_as_if_nothing_was_said() -> None:
     same(make(jnp.asarray(~ALL)), plain)
 
 
-def test_a_model_without_the_branch_does_not_ask() -> None:
+def test_a_model_without_depth_does_not_ask() -> None:
     params, (tokens, actions) = random_params(RGB), given(RGB, 2, 6, CLIPS)
     same(*(rollout(RGB, SampleConfig(steps=1), params, tokens, actions, KEY, no_depth=x) for x in (None, SOME)))
 

@@ -19,10 +19,10 @@ from rsjax.training.checkpoint import load_weights, save_weights
 from tests.models.roboscape.toy import depart
 from tests.tools.convert.public import genie_shapes, random_tensors
 
-ALONE = Architecture(frames=3, grid=2, code_bits=4, action_inputs=0, width=8, blocks=2, heads=2, use_depth=False)
+ALONE = Architecture(frames=3, grid=2, code_bits=4, action_inputs=0, width=8, blocks=2, heads=2, depth="none")
 BOTH = PublicCodeConfig(qk_norm=True, mup=True)
 MUP = PublicCodeConfig(mup=True)
-DUAL = depart(replace(ALONE, use_depth=True, action_inputs=5), action_dropout=0.1)
+DUAL = depart(replace(ALONE, depth="branch", action_inputs=5), action_dropout=0.1)
 
 
 def random_params(network: Architecture, seed: int = 0) -> Any:
@@ -43,7 +43,7 @@ def rgb_logits(network: Architecture, params: Any) -> np.ndarray:
     shape = (2, network.frames, network.grid, network.grid)
     tokens, depth = (rng.integers(0, 2**network.code_bits, shape, np.int32) for _ in range(2))
     mask, actions = rng.random(shape) < 0.4, rng.normal(size=(2, network.frames, network.action_inputs))
-    inputs = {"rgb": tokens, "depth": depth} if network.use_depth else {"rgb": tokens}
+    inputs = {"rgb": tokens, "depth": depth} if network.depth != "none" else {"rgb": tokens}
     apply = jax.jit(lambda p, *x: Transformer(network).apply({"params": p}, *x)[0]["rgb"])
     return np.asarray(apply(params, inputs, mask, actions.astype(np.float32)))
 
@@ -66,22 +66,26 @@ def public(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ],
     ids=["plain", "qk-norm and muP", "bfloat16", "MLP of actions"],
 )
-def test_a_dual_model_begins_with_the_very_logits_of_the_genie_it_starts_from(
-    options: dict[str, Any], tmp_path: Path
+@pytest.mark.parametrize("depth", ["branch", "head"])
+def test_a_model_with_depth_begins_with_the_very_logits_of_the_genie_it_starts_from(
+    depth: Any, options: dict[str, Any], tmp_path: Path
 ) -> None:
     settings = {"num_heads": ALONE.heads, "use_mup": "public_code" in options}
     tensors = random_tensors(genie_shapes(2, 8, 2, 3, 4, 4, "public_code" in options))
     config, params = from_public(Path("file"), tensors, settings)
     save(tmp_path, config, params)
-    alone, dual = replace(config, **options), replace(DUAL, **options)
+    alone, dual = replace(config, **options), replace(DUAL, depth=depth, **options)
     fresh = random_params(dual, seed=1)
     begun = begin(dual, tmp_path, fresh)
     expected = rgb_logits(alone, params)
     np.testing.assert_array_equal(rgb_logits(dual, begun), expected)
     assert expected.std() > 0.1
     assert jax.tree.map(jnp.shape, begun) == jax.tree.map(jnp.shape, fresh)
-    for path in ("depth_embed", "depth_head"):
-        jax.tree.map(np.testing.assert_array_equal, begun[path], fresh[path])
+    jax.tree.map(np.testing.assert_array_equal, begun["depth_head"], fresh["depth_head"])
+    if depth == "head":
+        assert not any(np.any(x) for x in jax.tree.leaves(begun["depth_embed"]))
+        return
+    jax.tree.map(np.testing.assert_array_equal, begun["depth_embed"], fresh["depth_embed"])
     jax.tree.map(np.testing.assert_array_equal, begun["blocks"]["depth"], fresh["blocks"]["depth"])
 
 
@@ -91,9 +95,11 @@ def test_a_dual_model_starts_from_a_dual_model_to_the_letter(tmp_path: Path) -> 
     jax.tree.map(np.testing.assert_array_equal, begin(DUAL, tmp_path), saved)
     (tmp_path / "empty").mkdir()
     for other, place, message in (
-        (ALONE, tmp_path, "action_encoder/bias has no place in this model"),
+        (ALONE, tmp_path, "depth is branch there, none here"),
+        (replace(DUAL, action_inputs=0), tmp_path, "action_encoder/bias has no place in this model"),
         (replace(DUAL, action_inputs=6), tmp_path, r"action_encoder/kernel is \(5, 8\), this model's is \(6, 8\)"),
         (depart(DUAL, integrate_actions=True), tmp_path, "integrate_actions is False there, True here"),
+        (replace(DUAL, depth="head"), tmp_path, "depth is branch there, head here"),
         (replace(DUAL, action_encoder="mlp"), tmp_path, "action_encoder is linear there, mlp here"),
         (DUAL, tmp_path / "empty", "holds no world_model/weights with their settings"),
     ):
@@ -122,5 +128,5 @@ def test_a_run_is_such_a_directory_too(tmp_path: Path) -> None:
     (tmp_path / "config.json").write_text(json.dumps(to_dict(config)))
     save_weights(tmp_path / "world_model" / "weights", random_params(genie))
     assert pretrained.read_architecture(tmp_path) == genie
-    begun = begin(replace(genie, use_depth=True, action_inputs=5, action_encoder="linear"), tmp_path)
+    begun = begin(replace(genie, depth="branch", action_inputs=5, action_encoder="linear"), tmp_path)
     jax.tree.map(np.testing.assert_array_equal, begun["blocks"]["rgb"], random_params(genie)["blocks"]["rgb"])

@@ -14,7 +14,7 @@ from rsjax.models.roboscape.sample import rollout
 from rsjax.models.roboscape.transformer import TokenEmbed, Transformer
 from rsjax.tokenizers import lfq
 from tests.models.roboscape.toy import depart
-from tests.models.roboscape.toy_sample import BATCH, DUAL, KEY, NO_PARAMS, RGB, count_model, given, random_params
+from tests.models.roboscape.toy_sample import BATCH, DUAL, HEAD, KEY, NO_PARAMS, RGB, count_model, given, random_params
 
 WHOLE = depart(DUAL, read_previous=True, whole_frames=True)
 
@@ -27,8 +27,9 @@ WHOLE = depart(DUAL, read_previous=True, whole_frames=True)
         (RGB, 3, SampleConfig(steps=2, temperature=1.0)),
         (depart(DUAL, read_previous=True), 1, SampleConfig(steps=2)),
         (WHOLE, 3, SampleConfig(steps=2, temperature=1.0)),
+        (depart(HEAD, read_previous=True), 3, SampleConfig(steps=4, unmask="greedy")),
     ],
-    ids=["dual-random", "dual-greedy", "rgb-warm", "previous", "whole-warm"],
+    ids=["dual-random", "dual-greedy", "rgb-warm", "previous", "whole-warm", "head-greedy"],
 )
 def test_cached_is_uncached(model: Architecture, prompt: int, sample: SampleConfig) -> None:
     params, (tokens, actions) = random_params(model), given(model, prompt)

@@ -13,7 +13,7 @@ from rsjax.models.roboscape.sample import rollout, window_actions, window_start
 from rsjax.models.roboscape.teacher_forcing import score_tokens
 from rsjax.models.roboscape.transformer import Transformer
 from tests.models.roboscape.toy import depart
-from tests.models.roboscape.toy_sample import BATCH, DUAL, KEY, RGB, given, random_params
+from tests.models.roboscape.toy_sample import BATCH, DUAL, HEAD, KEY, RGB, given, random_params
 
 SAMPLE = SampleConfig(steps=1, window_stride=2)
 SUMS = depart(replace(RGB, action_inputs=4), integrate_actions=True, read_previous=True)
@@ -36,8 +36,7 @@ def by_definition(model: Architecture, past: int, frames: int, no_depth: np.ndar
         seen = {name: np.pad(grid, [*room, (0, 0)])[:, base : base + length] for name, grid in tokens.items()}
         mask = np.zeros((BATCH, length, 3, 3), bool)
         mask[:, t - base :] = True
-        hidden = no_depth if model.use_depth else None
-        logits, _ = apply({"params": params}, seen, mask, rows, no_depth=hidden)
+        logits, _ = apply({"params": params}, seen, mask, rows, no_depth=no_depth)
         for name, grid in tokens.items():
             log_p = np.asarray(jax.nn.log_softmax(logits[name][:, t - base]))  # B S n V
             cells = grid[:, t].reshape(BATCH, 9)
@@ -54,8 +53,15 @@ def by_definition(model: Architecture, past: int, frames: int, no_depth: np.ndar
 
 @pytest.mark.parametrize(
     ("model", "past", "frames", "no_depth"),
-    [(DUAL, 1, 6, NONE), (DUAL, 2, 5, FIRST), (SUMS, 3, 11, NONE), (ROTARY, 1, 11, NONE), (WHOLE, 2, 9, NONE)],
-    ids=["dual", "some-without-depth-short", "windows-sums", "rotary-long", "whole-frames"],
+    [
+        (DUAL, 1, 6, NONE),
+        (DUAL, 2, 5, FIRST),
+        (SUMS, 3, 11, NONE),
+        (ROTARY, 1, 11, NONE),
+        (WHOLE, 2, 9, NONE),
+        (HEAD, 2, 5, FIRST),
+    ],
+    ids=["dual", "some-without-depth-short", "windows-sums", "rotary-long", "whole-frames", "head"],
 )
 def test_one_pass_with_the_cache_is_one_full_pass_for_each_frame(
     model: Architecture, past: int, frames: int, no_depth: np.ndarray

@@ -13,6 +13,7 @@ from tests.models.roboscape.toy import (
     DUAL,
     GENIE,
     GUIDED,
+    HEAD,
     NORMED,
     QK_NORM,
     READS_PREVIOUS,
@@ -28,7 +29,7 @@ from tests.models.roboscape.toy import (
 )
 
 CONFIGS = {"dual": DUAL, "rgb": RGB, "normed": NORMED, "qk-norm": QK_NORM, "previous": READS_PREVIOUS, "genie": GENIE}
-CONFIGS |= {"whole-frames": WHOLE}
+CONFIGS |= {"whole-frames": WHOLE, "head": HEAD, "head-previous": replace(READS_PREVIOUS, depth="head")}
 
 
 @pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS)
@@ -46,11 +47,11 @@ def count(params: Any) -> int:
 
 @pytest.mark.parametrize(("width", "published"), [(256, 35_218_688), (512, 137_545_216)])
 def test_one_branch_without_actions_has_the_published_size(width: int, published: int) -> None:
-    config = Architecture(width=width, use_depth=False, action_inputs=0)
+    config = Architecture(width=width, depth="none", action_inputs=0)
     params = jax.eval_shape(Transformer(config).init_params, jax.random.key(0))
     assert count(params) == published
 
-    dual = jax.eval_shape(Transformer(replace(config, use_depth=True)).init_params, jax.random.key(0))
+    dual = jax.eval_shape(Transformer(replace(config, depth="branch")).init_params, jax.random.key(0))
     assert count(dual) == 2 * published - count(params["pos_embed"]) + config.blocks * (width + 1) * width
 
 
@@ -236,7 +237,7 @@ def test_depth_never_reads_rgb() -> None:
     assert not np.allclose(before["rgb"], after["rgb"])
 
 
-@pytest.mark.parametrize("config", [DUAL, QK_NORM], ids=["dual", "qk-norm"])
+@pytest.mark.parametrize("config", [DUAL, QK_NORM, HEAD], ids=["dual", "qk-norm", "head"])
 @pytest.mark.parametrize("pieces", [(1, 1, 1, 1, 1), (2, 3)], ids=str)
 def test_pieces_through_the_cache_are_the_whole(config: Architecture, pieces: tuple[int, ...]) -> None:
     params, (tokens, mask, actions) = random_params(config), random_inputs(config)

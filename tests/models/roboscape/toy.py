@@ -8,6 +8,7 @@ import jax
 import numpy as np
 
 from rsjax.config import ClipShape, PublicCodeConfig, RoboScapeConfig, TokenizerConfig, TokenModelConfig
+from rsjax.config.config_fields import with_values
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.model import RoboScape
 from rsjax.models.roboscape.transformer import Transformer
@@ -19,7 +20,8 @@ def depart(architecture: Architecture, **departures: Any) -> Architecture:
 
 
 DUAL = Architecture(frames=5, grid=2, code_bits=4, action_inputs=3, width=8, blocks=2, heads=2)
-RGB = replace(DUAL, use_depth=False)
+RGB = replace(DUAL, depth="none")
+HEAD = replace(DUAL, depth="head")
 NORMED = depart(DUAL, more_norms=True)
 QK_NORM = replace(DUAL, public_code=PublicCodeConfig(qk_norm=True, mup=True))
 READS_PREVIOUS = depart(DUAL, read_previous=True)
@@ -31,7 +33,8 @@ BATCH = 2
 
 def roboscape(architecture: Architecture, config: TokenModelConfig | None = None, prompt_frames: int = 1) -> RoboScape:
     """A model of this architecture, whatever clips and tokenizer that would follow from."""
-    config = config or RoboScapeConfig(use_depth=architecture.use_depth, departures=architecture.departures)
+    if config is None:
+        config = with_values(RoboScapeConfig(departures=architecture.departures), {"depth": architecture.depth})
     clips = ClipShape(architecture.frames, 64, 7, architecture.action_inputs, 2)
     return RoboScape(config, architecture, prompt_frames, TokenizerConfig(), clips)
 
@@ -69,7 +72,7 @@ def random_params(config: Architecture) -> Any:
 def random_inputs(config: Architecture, seed: int = 0) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
     shape = (BATCH, config.frames, config.grid, config.grid)
-    tokens = {name: rng.integers(0, 2**config.code_bits, shape, np.int32) for name in config.branches}
+    tokens = {name: rng.integers(0, 2**config.code_bits, shape, np.int32) for name in config.modalities}
     return (
         tokens,
         rng.random(shape) < 0.4,
@@ -156,14 +159,20 @@ def plain_forward(config: Architecture, params: Any, inputs: tuple) -> dict[str,
         if config.departures.read_previous:
             absent = np.broadcast_to((np.arange(t) == 0)[None, :, None], flat.shape)
             x += embed(np.roll(flat, 1, axis=1), absent, p[f"{name}_previous_embed"], config)
-        h[name] = x + p["pos_embed"][:t]
-        if config.action_inputs:
+        h[name] = x
+        if name in config.branches:
+            h[name] = h[name] + p["pos_embed"][:t]
+        if name in config.branches and config.action_inputs:
             h[name] += (actions @ p["action_encoder"]["kernel"] + p["action_encoder"]["bias"])[:, :, None]
+    if config.depth == "head":
+        h = {"rgb": h["rgb"] + h["depth"]}
     for block in range(config.blocks):
         own = jax.tree.map(lambda x, block=block: x[block], p["blocks"])
         h = {name: st_block(x, own[name], config) for name, x in h.items()}
-        if config.use_depth:
+        if config.depth == "branch":
             h["rgb"] = h["rgb"] + h["depth"] @ own["depth_to_rgb"]["kernel"] + own["depth_to_rgb"]["bias"]
+    if config.depth == "head":
+        h["depth"] = h["rgb"]
     if config.departures.more_norms:
         h = {name: layer_norm(x, p[f"{name}_norm_out"]) for name, x in h.items()}
     if config.public.mup:

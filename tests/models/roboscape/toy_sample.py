@@ -14,7 +14,8 @@ from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.transformer import Transformer
 
 DUAL = Architecture(frames=6, grid=3, code_bits=6, action_inputs=3, width=16, blocks=2, heads=2)
-RGB = replace(DUAL, use_depth=False)
+RGB = replace(DUAL, depth="none")
+HEAD = replace(DUAL, depth="head")
 BATCH, KEY = 2, jax.random.key(5)
 NO_PARAMS: dict[str, Any] = {"blocks": {}}  # of a model that is taken out
 
@@ -29,7 +30,7 @@ def given(model: Architecture, prompt: int, frames: int = 6, batch: int = BATCH)
     """Prompt tokens and actions."""
     rng = np.random.default_rng(1)
     shape = (batch, prompt, model.grid, model.grid)
-    tokens = {name: rng.integers(0, 2**model.code_bits, shape, np.int32) for name in model.branches}
+    tokens = {name: rng.integers(0, 2**model.code_bits, shape, np.int32) for name in model.modalities}
     actions = rng.normal(size=(batch, frames, model.action_inputs)).astype(np.float32)
     actions[:, 0] = 0.0
     return tokens, actions

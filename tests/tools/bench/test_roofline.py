@@ -19,9 +19,12 @@ from rsjax.tools.bench.run import bench
 from tests.models.toy_family import ToyConfig
 
 
-@pytest.mark.parametrize("name", ["tiny", "genie_35m", "roboscape_s"])
-def test_their_products_are_all_that_the_model_counts(name: str) -> None:
-    config = presets.get(name)
+@pytest.mark.parametrize(
+    ("name", "changes"),
+    [("tiny", {}), ("tiny", {"model.depth": "head"}), ("genie_35m", {}), ("roboscape_s", {})],
+)
+def test_their_products_are_all_that_the_model_counts(name: str, changes: dict[str, Any]) -> None:
+    config = with_values(presets.get(name), changes)
     arch = replace(create_model(config).architecture, action_inputs=0)  # type: ignore[attr-defined]
     counted = sum(each.times * each.flops for each in operations(arch, config, 3))
     assert counted == 3 * forward_flops(arch, config.clips.frames)
@@ -50,7 +53,7 @@ def test_the_tokenizers_products_are_all_that_it_counts(
             assert ("scan" in str(program)) == (wide and config.compute_dtype == "bfloat16")
 
 
-@pytest.mark.parametrize("changes", [{}, {"use_depth": False, "departures.rotary": True}])
+@pytest.mark.parametrize("changes", [{}, {"depth": "head"}, {"depth": "none", "departures.rotary": True}])
 def test_a_cached_passs_products_are_all_that_the_model_counts(changes: dict[str, Any]) -> None:
     config = with_values(presets.debug(), {f"model.{name}": value for name, value in changes.items()})
     model = create_model(config)

@@ -19,7 +19,7 @@ from rsjax.tools.convert import directory
 from rsjax.tools.convert.directory import load_tokenizer, load_world_model, save
 from rsjax.tools.convert.files import ConvertError
 
-MODEL = Architecture(frames=3, grid=2, code_bits=4, action_inputs=0, width=8, blocks=2, heads=2, use_depth=False)
+MODEL = Architecture(frames=3, grid=2, code_bits=4, action_inputs=0, width=8, blocks=2, heads=2, depth="none")
 TOKENIZER = TokenizerConfig(
     patch_size=2, channels=8, channel_multipliers=(1, 2), res_blocks=1, norm_groups=4, code_bits=6
 )

@@ -1,5 +1,6 @@
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +38,7 @@ def source(tmp_path: Path) -> Path:
 @pytest.mark.parametrize(("width", "published"), [(256, 35_218_688), (512, 137_545_216)])
 @pytest.mark.parametrize("qk_norm", [False, True])
 def test_the_published_sizes_have_the_published_names_and_shapes(width: int, published: int, qk_norm: bool) -> None:
-    config = Architecture(width=width, use_depth=False, action_inputs=0, public_code=PublicCodeConfig(qk_norm))
+    config = Architecture(width=width, depth="none", action_inputs=0, public_code=PublicCodeConfig(qk_norm))
     shapes = public_shapes(table(config), jax.eval_shape(Transformer(config).init_params, jax.random.key(0)))
     assert shapes == genie_shapes(32, width, 8, 16, 256, 512, qk_norm)
     if not qk_norm:
@@ -50,7 +51,7 @@ def test_the_converted_model_computes_what_the_published_one_does(qk_norm: bool,
     rng = np.random.default_rng(0)
     config, params = from_public(Path("file"), public, SETTINGS | {"use_mup": mup, "qk_norm": qk_norm})
     assert (config.public.mup, config.public.qk_norm) == (mup, qk_norm)
-    assert (config.action_inputs, config.use_depth) == (0, False)
+    assert (config.action_inputs, config.depth) == (0, "none")
     tokens = rng.integers(0, CODES**2, (2, FRAMES, 2, 2), np.int32)
     mask = rng.random(tokens.shape) < 0.4
     logits, _ = jax.jit(lambda *x: Transformer(config).apply({"params": params}, *x))({"rgb": tokens}, mask, None)
@@ -159,7 +160,8 @@ def test_all_misfits_are_named_in_one_error() -> None:
 @pytest.mark.parametrize(
     "fields",
     [
-        {"use_depth": True},
+        {"depth": "branch"},
+        {"depth": "head"},
         {"departures": Departures(more_norms=True)},
         {"action_inputs": 7},
         {"departures": Departures(rotary=True)},
@@ -167,7 +169,7 @@ def test_all_misfits_are_named_in_one_error() -> None:
     ids=str,
 )
 def test_a_model_without_public_names_is_not_exported(fields: dict[str, Any]) -> None:
-    config = Architecture(**{"width": 16, "blocks": 2, "heads": 2, "use_depth": False, "action_inputs": 0} | fields)
+    config = replace(Architecture(width=16, blocks=2, heads=2, depth="none", action_inputs=0), **fields)
     params = jax.eval_shape(Transformer(config).init_params, jax.random.key(0))
     with pytest.raises(ConvertError, match="no name for these parts|cannot express model.departures.rotary"):
         to_tensors(params, table(config))

@@ -26,7 +26,7 @@ def random_params(init: Any) -> Any:
 def test_a_run_of_no_steps_keeps_the_weights_that_it_starts_from(tmp_path: Path) -> None:
     cfg, public = toy.config(), tmp_path / "public"
     tokenizer = random_params(Tokenizer(cfg.tokenizer).init_params)
-    alone = replace(Architecture.create(cfg), use_depth=False, action_encoder="none", action_inputs=0)
+    alone = replace(Architecture.create(cfg), depth="none", action_encoder="none", action_inputs=0)
     model = random_params(Transformer(alone).init_params)
     directory.save(public, cfg.tokenizer, tokenizer)
     directory.save(public, alone, model)

@@ -138,7 +138,7 @@ def test_another_configuration_is_refused(debug: Path, command: Commands, field:
 
 
 def test_parts_that_are_switched_off_are_gone_and_the_rest_runs(run: Path, debug: Path, command: Commands) -> None:
-    off = ("--model.use-depth", "False", "--model.loss.keypoints", "none")
+    off = ("--model.depth", "none", "--model.loss.keypoints", "none")
     done = command.train(run, *off, "--overwrite")
     assert done.returncode == 0, done.stderr
     assert skipped(done.stdout) == list(STAGES[:3])

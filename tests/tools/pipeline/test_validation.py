@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rsjax.config import Config, EvalConfig
+from rsjax.config import Config, EvalConfig, NoDepth
 from rsjax.data.clips import readable
 from rsjax.data.depth_color import depth_to_color
 from rsjax.data.loader import Arrays, Transform
@@ -108,7 +108,7 @@ def test_there_is_a_picture_of_each_shown_clip_with_depth_only_where_the_model_h
     run: Run, found: Validation, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert list(found.pictures) == ["clip_000", "clip_001"]
-    blind = Run(toy.with_model(run.config, use_depth=False), run.directory, run.data_directory)
+    blind = Run(toy.with_model(run.config, depth=NoDepth()), run.directory, run.data_directory)
     monkeypatch.setattr(module, "validation_loss", lambda *_: {"loss": 0.5})
     seen = WorldModelValidation(blind)(7, trained(blind).params)
     assert seen.scalars.keys() == {"validation/loss", "validation/psnr"}

@@ -21,15 +21,14 @@ from rsjax.progress import note
 
 Value = bool | int | float | str
 
-DEFAULT_AXES = ("model.use_depth=True,False", "model.loss.keypoints=printed,none")
-SWITCHES = {  # a field → the switch without which the field has no effect
-    "model.loss.depth_weight": "model.use_depth",
+DEFAULT_AXES = ("model.depth=branch,head,none", "model.loss.keypoints=printed,none")
+SWITCHES = {  # a field → the switch that is "none" where the field has no effect
+    "model.loss.depth_weight": "model.depth",
     "model.loss.keypoint_weight": "model.loss.keypoints",
     "model.loss.attention_weight": "model.loss.keypoints",
     "model.loss.gamma": "model.loss.keypoints",
     "model.loss.num_keypoints": "model.loss.keypoints",
 }
-OFF: tuple[Value, ...] = (False, "none")  # values of a switch that is off
 SEED = "train.seed"
 FILE = "grid.json"
 LIBRARIES = ("rsjax", "jax", "flax", "optax", "numpy")  # libraries whose versions the file records
@@ -58,7 +57,7 @@ class Choice:
 
     Attributes:
         number: the position of a single cell, counted from 0; None for all.
-        only: names or shell patterns (``model.use_depth=True,*``); cells that match none are left out. Empty for all.
+        only: names or shell patterns (``model.depth=head,*``); cells that match none are left out. Empty for all.
         skip: names or patterns of cells to leave out.
     """
 
@@ -166,7 +165,7 @@ def values_of(config: Config, fields: Sequence[str]) -> dict[str, Value]:
 
 
 def cell_name(values: Mapping[str, Value], seed: int) -> str:
-    """Returns a directory name that shows the values, such as ``model.use_depth=True,loss.gamma=5.0,seed=0``.
+    """Returns a directory name that shows the values, such as ``model.depth=head,model.loss.gamma=5.0,seed=0``.
 
     A name that is too long is shortened, unsafe characters are replaced, and a hash then keeps the name unique.
     """
@@ -184,18 +183,10 @@ def repeated_cells(grid: Grid) -> list[str]:
     for field, switch in SWITCHES.items():
         if field not in grid.fields:
             continue
-        for word in OFF:
-            off = {known[field].value for known in cells if field in known and off_by(known, switch, word)}
-            if len(off) > 1:
-                lines.append(
-                    f"{field} has no effect where {switch} is {word}; cells that differ in it alone are the same"
-                )
+        off = {known[field].value for known in cells if switch in known and known[switch].value == "none"}
+        if len(off) > 1:
+            lines.append(f"{field} has no effect where {switch} is none; cells that differ in it alone are the same")
     return lines
-
-
-def off_by(fields: Mapping[str, ConfigField], switch: str, word: Value) -> bool:
-    """Whether this switch is among a configuration's fields and has this value."""
-    return switch in fields and fields[switch].value == word
 
 
 def merge(before: Grid | None, new: Grid, out: Path) -> tuple[Grid, tuple[str, ...]]:

@@ -33,7 +33,7 @@ class Row:
 
     @property
     def label(self) -> str:
-        """The row's values, such as ``model.use_depth True, model.loss.use_keypoints False``."""
+        """The row's values, such as ``model.depth head, model.loss.keypoints none``."""
         return ", ".join(f"{name} {value}".strip() for name, value in self.values.items()) or "as configured"
 
     @property

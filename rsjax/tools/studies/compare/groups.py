@@ -42,7 +42,7 @@ class Group:
 def parse_group(text: str) -> tuple[str, tuple[Path, ...]]:
     """Returns the name and the run directories of ``NAME=RUN,RUN…``, or of one ``RUN``, whose directory is the name.
 
-    A run may be a pattern such as ``runs/grid/model.use_depth=True,*``. Directories may have commas in their names.
+    A run may be a pattern such as ``runs/grid/model.depth=head,*``. Directories may have commas in their names.
 
     Raises:
         ConfigError: a directory does not exist or is named twice, or a pattern matches no directory.

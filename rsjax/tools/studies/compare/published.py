@@ -44,13 +44,13 @@ def published_name(model: Mapping[str, Any]) -> str | None:
     settings = model.get("settings", {})
     if name != "RoboScape":
         return name
-    depth = settings.get("use_depth", True)
+    depth = settings.get("depth", {}).get("kind", "branch")
     keypoints = settings.get("loss", {}).get("keypoints", "printed")
     rows = {
-        (True, "printed"): "RoboScape",
-        (False, "printed"): "RoboScape w/o depth",
-        (True, "none"): "RoboScape w/o keypoints",
-        (False, "none"): "RoboScape w/o both",
+        ("branch", "printed"): "RoboScape",
+        ("none", "printed"): "RoboScape w/o depth",
+        ("branch", "none"): "RoboScape w/o keypoints",
+        ("none", "none"): "RoboScape w/o both",
     }
     return rows.get((depth, keypoints))
 

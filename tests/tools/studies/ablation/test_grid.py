@@ -31,7 +31,7 @@ from tests.tools.studies.ablation import toy
 
 DEBUG = presets.debug()
 VALUES = {
-    "model.use_depth": st.booleans(),
+    "model.depth": st.sampled_from(["branch", "head", "none"]),
     "model.loss.keypoints": st.sampled_from(["none", "printed", "difference"]),
     "model.loss.depth_weight": st.floats(0, 10),
     "model.loss.gamma": st.floats(0, 100),
@@ -73,8 +73,7 @@ def test_names_that_had_to_be_changed_stay_apart() -> None:
     assert cell_name({"a": "x/y"}, 0) != cell_name({"a": "x y"}, 0) != cell_name({"a": "x-y"}, 0)
     assert cell_name({"a": "x" * 300}, 0) != cell_name({"a": "x" * 301}, 0)
     assert (
-        cell_name({"model.loss.gamma": 5.0, "model.use_depth": True}, 3)
-        == "model.loss.gamma=5.0,model.use_depth=True,seed=3"
+        cell_name({"model.loss.gamma": 5.0, "model.depth": "head"}, 3) == "model.loss.gamma=5.0,model.depth=head,seed=3"
     )
 
 
@@ -82,9 +81,10 @@ def test_without_axes_there_is_a_cell_per_seed() -> None:
     assert list(toy.grid(seeds=(4, 2)).cells) == ["seed=4", "seed=2"]
 
 
-def test_the_default_is_depth_and_keypoints_on_and_off() -> None:
+def test_the_default_is_ways_to_use_depth_with_keypoints_on_and_off() -> None:
+    ways = ("branch", "head", "none")
     models = map(toy.roboscape, toy.grid(*DEFAULT_AXES).cells.values())
-    assert [(m.use_depth, m.loss.keypoints) for m in models] == list(product((True, False), ("printed", "none")))
+    assert [(m.depth.kind, m.loss.keypoints) for m in models] == list(product(ways, ("printed", "none")))
 
 
 def test_the_named_fields_exist() -> None:
@@ -101,7 +101,8 @@ def test_a_value_as_printed_is_read_back() -> None:
 @pytest.mark.parametrize(
     ("name", "text", "line"),
     [
-        ("model.use_depth", "Tru", "model.use_depth is 'Tru' in the grid; did you mean 'True'? (choices: True, False)"),
+        ("tokenizer.local_codes", "Tru", "is 'Tru' in the grid; did you mean 'True'? (choices: True, False)"),
+        ("model.depth", "heads", "is 'heads' in the grid; did you mean 'head'? (choices: branch, head, none)"),
         ("model.sample.unmask", "greed", "did you mean 'greedy'? (choices: random, greedy)"),
         ("model.loss.gamma", "five", "model.loss.gamma is 'five' in the grid; it takes a number"),
         ("model.loss.gamma", "nan", "it takes a number"),
@@ -153,19 +154,22 @@ def test_a_weight_of_a_term_that_is_off_is_reported() -> None:
     assert repeated_cells(toy.grid(f"{gamma}=4,5", f"{switch}=printed,none")) == [
         f"{gamma} has no effect where {switch} is none; cells that differ in it alone are the same"
     ]
-    assert not repeated_cells(toy.grid("model.loss.gamma=4,5", "model.use_depth=True,False"))
+    assert repeated_cells(toy.grid("model.loss.depth_weight=1,2", "model.depth=head,none")) == [
+        "model.loss.depth_weight has no effect where model.depth is none; cells that differ in it alone are the same"
+    ]
+    assert not repeated_cells(toy.grid("model.loss.gamma=4,5", "model.depth=branch,none"))
 
 
 def test_cells_are_chosen_by_number_name_and_pattern() -> None:
     names = list(toy.grid(*DEFAULT_AXES, seeds=(0, 1)).cells)
     assert list(Choice().of(names)) == names
     assert list(Choice(number=3).of(names)) == [names[3]]
-    assert list(Choice(only=("*seed=1", names[0])).of(names)) == [names[0], *names[4:]]
-    assert list(Choice(only=("*seed=1",), skip=("model.use_depth=True,*",)).of(names)) == names[6:]
+    assert list(Choice(only=("*seed=1", names[0])).of(names)) == [names[0], *names[6:]]
+    assert list(Choice(only=("*seed=1",), skip=("model.depth=branch,*",)).of(names)) == names[8:]
     assert Choice(number=0, only=("*seed=1",)).of(names) == ()
     for choice, line in (
-        (Choice(number=8), "cell 8 is not in this grid; its cells are 0 … 7"),
-        (Choice(only=(names[0].replace("Tr", "T"),)), f"did you mean '{names[0]}'"),
+        (Choice(number=12), "cell 12 is not in this grid; its cells are 0 … 11"),
+        (Choice(only=(names[0].replace("br", "b"),)), f"did you mean '{names[0]}'"),
         (Choice(skip=("seed",)), "--skip seed: no such cell"),
     ):
         with pytest.raises(ConfigError) as caught:
@@ -187,16 +191,16 @@ def test_a_grid_is_read_as_it_was_written(tmp_path: Path) -> None:
 
 
 def test_more_values_fields_and_seeds_add_cells_and_keep_those_there_are(tmp_path: Path) -> None:
-    first = toy.grid("model.use_depth=True,False")
+    first = toy.grid("model.depth=branch,none")
     add(tmp_path, first)
     names = add(tmp_path, toy.grid("model.loss.gamma=4,5", seeds=(0, 1)))
-    assert names[0] == "model.use_depth=True,model.loss.gamma=4.0,seed=0"
-    assert names[1] == "model.use_depth=True,seed=0", "γ is 5 already: that cell is there"
+    assert names[0] == "model.depth=branch,model.loss.gamma=4.0,seed=0"
+    assert names[1] == "model.depth=branch,seed=0", "γ is 5 already: that cell is there"
     grid = read_grid(tmp_path)
     assert grid is not None
-    assert list(grid.cells) == ["model.use_depth=True,seed=0", "model.use_depth=False,seed=0", names[0], *names[2:]]
+    assert list(grid.cells) == ["model.depth=branch,seed=0", "model.depth=none,seed=0", names[0], *names[2:]]
     assert list(grid.cells.values())[:2] == list(first.cells.values())
-    assert grid.fields == ("model.use_depth", "model.loss.gamma")
+    assert grid.fields == ("model.depth", "model.loss.gamma")
     assert len(set(grid.cells.values())) == len(grid.cells) == 5
 
 
@@ -205,7 +209,7 @@ def test_cells_of_several_bases_keep_their_values_and_names_apart(tmp_path: Path
     add(tmp_path, toy.grid("model.loss.gamma=4,5"))
     for gamma in (6.0, 7.0):
         base = with_values(DEBUG, {"model.loss.gamma": gamma})
-        add(tmp_path, toy.grid("model.use_depth=True", base=base))
+        add(tmp_path, toy.grid("model.depth=branch", base=base))
     grid = read_grid(tmp_path)
     assert grid is not None
     assert [toy.roboscape(config).loss.gamma for config in grid.cells.values()] == [4.0, 5.0, 6.0, 7.0]

@@ -27,7 +27,7 @@ from tests.tools.studies.ablation import toy
 
 COLUMNS = tuple(column for column in metrics().values() if column.column)
 PSNR = metrics()["psnr"]
-GRID = toy.grid("model.use_depth=True,False", "model.loss.keypoints=printed,none", seeds=(0, 1, 2))
+GRID = toy.grid("model.depth=branch,none", "model.loss.keypoints=printed,none", seeds=(0, 1, 2))
 RUNS = list(runs_of(GRID, Path("out"), Path("data")).values())
 
 
@@ -65,10 +65,10 @@ def test_rows_gather_the_seeds_of_equal_values() -> None:
     metrics = full(np.random.default_rng(0))
     rows = rows_of(metrics)
     assert [tuple(row.values.values()) for row in rows] == [
-        (True, "printed"),
-        (True, "none"),
-        (False, "printed"),
-        (False, "none"),
+        ("branch", "printed"),
+        ("branch", "none"),
+        ("none", "printed"),
+        ("none", "none"),
     ]
     for number, row in enumerate(rows):
         seeds = [metrics[number + 4 * seed]["psnr"] for seed in range(3)]
@@ -96,13 +96,13 @@ def test_markdown_shows_means_spreads_counts_absences_and_the_best() -> None:
     metrics = {0: {"psnr": 20.0, "depth_absrel": 0.1}, 4: {"psnr": 21.0, "depth_absrel": 0.3}, 2: {"psnr": 22.0}}
     text = as_markdown(rows_of(metrics))
     lines = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines() if line[:1] == "|"]
-    assert lines[0] == ["model.use_depth", "model.loss.keypoints", "seeds", "PSNR, dB ↑", "depth AbsRel ↓"]
-    assert lines[2] == ["True", "printed", "2/3", "20.50 ± 0.71", "0.2000 ± 0.1414"]
-    assert lines[3] == ["True", "none", "0/3", "–", "–"]
-    assert lines[4] == ["False", "printed", "1/3", "**22.00**", "–"]
+    assert lines[0] == ["model.depth", "model.loss.keypoints", "seeds", "PSNR, dB ↑", "depth AbsRel ↓"]
+    assert lines[2] == ["branch", "printed", "2/3", "20.50 ± 0.71", "0.2000 ± 0.1414"]
+    assert lines[3] == ["branch", "none", "0/3", "–", "–"]
+    assert lines[4] == ["none", "printed", "1/3", "**22.00**", "–"]
     assert len({len(line) for line in text.splitlines() if line.startswith("|")}) == 1
-    assert text.count("- model.use_depth=") == 9
-    assert "- model.use_depth=False,model.loss.keypoints=none,seed=2: missing (its reason)" in text
+    assert text.count("- model.depth=") == 9
+    assert "- model.depth=none,model.loss.keypoints=none,seed=2: missing (its reason)" in text
 
 
 def test_an_absent_metric_has_its_reason_as_a_footnote() -> None:
@@ -130,7 +130,7 @@ def test_files_have_every_metric_at_full_precision() -> None:
     lines = list(csv.DictReader(io.StringIO(as_csv(rows))))
     saved = as_json(rows)
     for row, line, entry in zip(rows, lines, saved["rows"], strict=True):
-        assert line["model.use_depth"] == str(row.values["model.use_depth"])
+        assert line["model.depth"] == str(row.values["model.depth"])
         assert entry["values"] == row.values
         for name, numbers in row.spreads.items():
             assert [float(line[f"{name}_{part}"]) for part in ("mean", "std", "n")] == list(numbers)

@@ -291,7 +291,9 @@ def test_a_setting_of_sampling_is_noted_only_where_it_differs(make: Make, reads:
 
 
 def test_rows_of_the_paper() -> None:
-    settings = {"use_depth": False, "loss": {"keypoints": "printed"}}
-    assert published_name({"family": "roboscape", "settings": settings}) == "RoboScape w/o depth"
+    rows = {"branch": "RoboScape", "none": "RoboScape w/o depth", "head": None}
+    for kind, row in rows.items():
+        settings = {"depth": {"kind": kind}, "loss": {"keypoints": "printed"}}
+        assert published_name({"family": "roboscape", "settings": settings}) == row
     assert published_name({"family": "irasim"}) == "IRASim"
     assert published_name({"family": "mine"}) is None

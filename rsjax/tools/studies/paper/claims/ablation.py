@@ -8,9 +8,9 @@ from rsjax.tools.studies.paper.claim import Arm, Claim, pairs, register
 # Depth errors must be an estimator's, since the model without depth has them too.
 _DEPTH = tuple(f"depth_{name}_median_estimator" for name in ("absrel", "delta1", "delta2"))
 _WITHOUT: dict[str, dict[str, Any]] = {
-    "w/o depth": {"model.use_depth": False},
+    "w/o depth": {"model.depth": "none"},
     "w/o keypoints": {"model.loss.keypoints": "none"},
-    "w/o both": {"model.use_depth": False, "model.loss.keypoints": "none"},
+    "w/o both": {"model.depth": "none", "model.loss.keypoints": "none"},
 }
 
 register(
