@@ -188,6 +188,20 @@ def welch(a: Float[np.ndarray, " S"], b: Float[np.ndarray, " Z"], level: float =
     )
 
 
+def holm(p: ArrayLike) -> Float[np.ndarray, " M"]:
+    """Returns the p-values of M tests adjusted by Holm's method, in the order given.
+
+    If a test is rejected where its adjusted p-value is below a level, then the probability that any true hypothesis of
+    the M is rejected is below this level, however the tests depend on one another (Holm, 1979).
+    """
+    values = np.asarray(p, np.float64)
+    order = np.argsort(values, kind="stable")
+    scaled = values[order] * np.arange(len(values), 0, -1)
+    adjusted = np.empty_like(values)
+    adjusted[order] = np.minimum(1, np.maximum.accumulate(scaled))
+    return adjusted
+
+
 def wilson(successes: int, trials: int, level: float = 0.95) -> Estimate:
     """Returns a share and Wilson's score interval, which stays within [0, 1] and is valid for few trials too.
 

@@ -1,10 +1,13 @@
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy import stats
 
 from rsjax.evaluation.statistics import (
     Estimate,
     bootstrap,
+    holm,
     over_predicted_frames,
     paired_bootstrap,
     share_difference,
@@ -140,3 +143,19 @@ def test_the_difference_of_shares_is_newcombes_and_tells_nothing_of_few_trials_t
     assert verdict(share_difference(np.zeros(60), np.zeros(60)), "higher", -0.1) == "holds"
     with pytest.raises(ValueError, match="no share"):
         share_difference([], [1])
+
+
+@given(st.lists(st.floats(0, 1), min_size=1, max_size=8))
+def test_holms_p_rejects_what_holms_steps_reject(p: list[float]) -> None:
+    """Holm (1979): reject the smallest p while it is at most level / (hypotheses that are left)."""
+    adjusted = holm(p)
+    for level in (0.001, 0.01, 0.05, 0.2, 0.9):
+        left = sorted(range(len(p)), key=lambda i: p[i])
+        rejected = set()
+        while left and p[left[0]] <= level / len(left):
+            rejected.add(left.pop(0))
+        near = np.isclose(adjusted, level)  # p × n and level / n may round differently
+        assert {i for i in range(len(p)) if adjusted[i] <= level and not near[i]} == {
+            i for i in rejected if not near[i]
+        }
+    assert (adjusted >= p).all() and (adjusted <= 1).all()

@@ -48,9 +48,16 @@ class Table:
     first_bold: bool = False
 
 
-def as_markdown(table: Table) -> str:
-    """Returns a table as Markdown whose columns are aligned in the source as well."""
+def as_markdown(table: Table, aligned: bool = True) -> str:
+    """Returns a table as Markdown.
+
+    Args:
+        aligned: whether to align the columns in the source as well, which makes every line as long as the longest.
+    """
     texts = [[_markdown_cell(cell) for cell in row] for row in (table.head, *table.rows)]
+    if not aligned:
+        lines = ["|".join(["", *(f" {text} ".replace("  ", " ") for text in row), ""]) for row in texts]
+        return "\n".join([lines[0], "|" + "---|" * len(table.head), *lines[1:]])
     widths = [max(map(len, column)) for column in zip(*texts, strict=True)]
     texts.insert(1, ["-" * width for width in widths])
     lines = [" | ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)) for row in texts]
@@ -98,6 +105,11 @@ def mean_text(spread: Spread, decimals: int) -> str:
     if spread.std is None:
         return f"{spread.mean:.{decimals}f}"
     return f"{spread.mean:.{decimals}f} ± {spread.std:.{decimals}f}"
+
+
+def p_text(p: float) -> str:
+    """Returns a p-value with three digits after the point."""
+    return "< 0.001" if p < 0.001 else f"{p:.3f}"
 
 
 def interval_text(interval: Estimate | None, decimals: int) -> str:

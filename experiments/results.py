@@ -1,0 +1,38 @@
+"""Makes the tables of the pages on results from the files of results. ``python -m experiments.results``"""
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from experiments.cli import main_errors, parse_options
+from rsjax.errors import UserError
+
+PROG = "python -m experiments.results"
+
+
+@dataclass(frozen=True)
+class Options:
+    """Makes the tables of docs/results and of the README anew from the files in docs/results/data."""
+
+    check: bool = False
+    """Change nothing; name each table that differs from its file, and exit with 2 if there is any."""
+
+
+@main_errors()
+def main() -> None:
+    """Writes the pages, or checks them."""
+    options = parse_options(sys.argv[1:], PROG, Options.__doc__ or "", Options())
+    from rsjax.tools.studies import result_pages
+
+    root = Path(__file__).resolve().parents[1]
+    if options.check:
+        differing = list(result_pages.differences(root))
+        if differing:
+            raise UserError("; ".join(differing) + f" ({PROG} makes them anew)")
+    else:
+        for page in result_pages.write_pages(root):
+            print(page)
+
+
+if __name__ == "__main__":
+    main()
