@@ -1,9 +1,9 @@
 """Tables of earlier runs whose scores per clip were not kept: the cells as they were printed, with verdicts made anew.
 
 A file says what its tables hold, and where it is from (``commit``, ``command``, ``machine``, ``date``). Each of its
-tables has ``head`` and ``rows``, as they were printed. A table of comparisons also has ``judge``: ``lower``, the metrics
-for which lower is better; ``family``, "table" if the whole table is one claim, "group" if each row with a first cell
-begins another claim; ``further``, the p-values of comparisons of the same claim that the table leaves out.
+tables has ``head`` and ``rows``, as they were printed. A table of comparisons also has ``judge``: ``lower``, the
+metrics for which lower is better; ``family``, "table" if the whole table is one claim, "group" if each row with a first
+cell begins another claim; ``further``, the p-values of comparisons of the same claim that the table leaves out.
 
 Its interval is the one that was printed, from resampling seeds and clips. Welch's, which may be wider, can no longer be
 computed, but its test is: a comparison is decided only if the interval and Holm's p agree.
