@@ -45,7 +45,7 @@ FIRST_FIELDS = {
     "model.loss.depth-weight": "λ₁, the weight of the depth loss.",
     "model.loss.keypoint-weight": "λ₂, the weight of the keypoint loss.",
     "model.loss.attention-weight": "λ₃, the weight of the attention loss.",
-    "model.loss.keypoints": "The keypoint loss: none, printed (Eq. 5) or difference (docs/models.md).",
+    "model.loss.keypoints": "The keypoint loss: none, printed (Eq. 5), difference, motion or feature.",
     "model.sample.steps": "Decoding steps per generated frame.",
     "eval.clips": "Test clips to evaluate on.",
     "eval.weights": "A directory with the weights of LPIPS and FVD (see docs/evaluation.md).",

@@ -179,9 +179,11 @@ class LossConfig:
     # How Eq. 6 weighs cells. printed: Eq. 7, a second cross-entropy beside L_RGB. normalised: weights of the mean 1 on
     # the one cross-entropy, whose weight is 1 (rsjax.models.roboscape.departures.normalised_attention).
     attention: Literal["printed", "normalised"] = "printed"
-    # The keypoint term. printed: Eq. 5, whose minimum is not the truth. difference: the change of a point's code from
-    # frame to frame (rsjax.models.roboscape.departures.keypoint_difference). none: neither a keypoint term nor Eq. 7.
-    keypoints: Literal["none", "printed", "difference"] = "printed"
+    # The keypoint term. printed: Eq. 5, whose minimum is not the truth. Not in the paper, each in a file of
+    # rsjax.models.roboscape.departures: difference (keypoint_difference), the change of a point's code from frame to
+    # frame; motion (motion_head), where each point goes; feature (keypoint_features), the network's features along a
+    # track. none: neither a keypoint term nor Eq. 7.
+    keypoints: Literal["none", "printed", "difference", "motion", "feature"] = "printed"
     num_keypoints: int = 32  # K of the top-K, at most all tracks; the paper does not give its K
 
     def __post_init__(self) -> None:
@@ -260,6 +262,11 @@ class TokenModelConfig(TransformerConfig, ModelConfig):
     def scanned(self) -> int:
         return self.blocks
 
+    @property
+    def keypoint_term(self) -> str:
+        """The keypoint term that the model trains with (:attr:`LossConfig.keypoints`); "none" also if λ₂ is 0."""
+        return "none"
+
     def frames(self, clips: ClipShape) -> int:
         """Returns the number of positions in time for such clips."""
         return self.max_frames or clips.frames
@@ -314,6 +321,12 @@ class RoboScapeConfig(TokenModelConfig):
     @property
     def uses_depth(self) -> bool:
         return not isinstance(self.depth, NoDepth)
+
+    @property
+    def keypoint_term(self) -> str:
+        if "keypoint" in self.loss_weights:
+            return self.loss.keypoints
+        return "none"
 
     @property
     def marked_keypoints(self) -> int:

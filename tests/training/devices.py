@@ -3,10 +3,10 @@
 Prints, as JSON, how far the world model's parameters end from those of one device (the largest difference, and the
 distance as a share of the way that training moved them), for "pmap", "mesh" (data alone), "fsdp" (2 × 2), and "muon": a
 smaller network by Muon under fsdp. "gradient pmap" …: how far the gradient of the first step is from one device's, as a
-share; some clips have no depth. "gradient head": the same under fsdp of a model with a depth head. "mean of ratios" and
-"depth mean of ratios": how far the loss and its depth term are, as a share, if every device divides by its own weight.
-For the tokenizer: how far gradients and averages are from one device's ("tokenizer pmap", "tokenizer fsdp"), and how
-far its entropy is if each device knows its own images alone ("tokenizer apart").
+share; some clips have no depth. "gradient heads": the same under fsdp of a model with a depth head and a motion head.
+"mean of ratios" and "depth mean of ratios": how far the loss and its depth term are, as a share, if every device
+divides by its own weight. For the tokenizer: how far gradients and averages are from one device's ("tokenizer pmap",
+"tokenizer fsdp"), and how far its entropy is if each device knows its own images alone ("tokenizer apart").
 "checkpoint": how far two steps of one sharding, saved, and a third one of another are from three steps; "start":
 whether fresh parameters are the same to the bit if they are made in parts; "cut": the share of the fsdp state that
 one device holds.
@@ -68,7 +68,7 @@ CONFIG = Config(
     train=LOOP,
 )
 MODEL = RoboScape.create(CONFIG)
-HEAD = RoboScape.create(with_values(CONFIG, {"model.depth": "head"}))
+HEADS = RoboScape.create(with_values(CONFIG, {"model.depth": "head", "model.loss.keypoints": "motion"}))
 TOKENIZER = TokenizerTraining.create(CONFIG)
 MUON = replace(LOOP, optimizer=Muon(learning_rate=1e-2, warmup_steps=1))
 SHARDINGS: dict[str, dict[str, Any]] = {
@@ -236,7 +236,7 @@ def main() -> dict[str, Any]:
     fresh = jax.device_get(jax.jit(partial(create_state, TOKENIZER, CONFIG.loop("tokenizer")))())
     trainings = {kind: Training(kind, MODEL, LOOP, clips, start) for kind in SHARDINGS}
     small = {kind: Training(kind, Small(), MUON, clips, None) for kind in ("jit", "fsdp")}
-    heads = {kind: Training(kind, HEAD, LOOP, clips, None) for kind in ("jit", "fsdp")}
+    heads = {kind: Training(kind, HEADS, LOOP, clips, None) for kind in ("jit", "fsdp")}
     kinds = ("jit", "pmap", "fsdp")
     tokenizers = {kind: Training(kind, TOKENIZER, CONFIG.loop("tokenizer"), [IMAGES], fresh) for kind in kinds}
     with ThreadPoolExecutor(2) as pool:
@@ -253,7 +253,7 @@ def main() -> dict[str, Any]:
     return {
         **{kind: distance(ends["jit"], ends[kind], start) for kind in ("pmap", "mesh", "fsdp")},
         **{f"gradient {kind}": share(gradients["jit"], gradients[kind]) for kind in ("pmap", "mesh", "fsdp")},
-        "gradient head": share(of_head["jit"], of_head["fsdp"]),
+        "gradient heads": share(of_head["jit"], of_head["fsdp"]),
         "muon": distance(muon["jit"], muon["fsdp"], begun["jit"]),
         "mean of ratios": of_loss,
         "depth mean of ratios": of_depth,

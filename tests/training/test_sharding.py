@@ -52,7 +52,7 @@ def test_every_sharding_gives_the_same_parameters_on_uneven_batches(kind: str, a
     assert apart["mean of ratios"] > 0.01, "the batches are too even to tell the right loss from the wrong one"
 
 
-@pytest.mark.parametrize("kind", ["pmap", "mesh", "fsdp", "head"])
+@pytest.mark.parametrize("kind", ["pmap", "mesh", "fsdp", "heads"])
 def test_clips_without_depth_count_alike_on_every_device(kind: str, apart: dict[str, Any]) -> None:
     assert apart[f"gradient {kind}"] < 1e-5, apart
     assert apart["depth mean of ratios"] > 0.01, "the batches are too even to tell the right loss from the wrong one"

@@ -28,6 +28,8 @@ class Architecture(TransformerConfig):
         action_inputs: numbers per frame that the action encoder reads; 0: no encoder.
         depth: how the network uses depth: in a branch of its own (Eq. 2 and 3), by a second head on the RGB branch, or
             not at all.
+        motion_head: whether training predicts how tracked points move
+            (:mod:`rsjax.models.roboscape.departures.motion_head`).
         feature_dtype: of the features between layers; :func:`rsjax.models.roboscape.transformer.run_transformer` sets
             it.
     """
@@ -38,6 +40,7 @@ class Architecture(TransformerConfig):
     vocabularies: int = 2
     action_inputs: int = 28
     depth: Literal["branch", "head", "none"] = "branch"
+    motion_head: bool = False
     feature_dtype: Literal["float32", "bfloat16"] = "float32"
 
     @classmethod
@@ -60,6 +63,7 @@ class Architecture(TransformerConfig):
             vocabularies=config.tokenizer.vocabularies,
             action_inputs=inputs,
             depth=depth.kind,
+            motion_head=model.keypoint_term == "motion",
         )
 
     @property

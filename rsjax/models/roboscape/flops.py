@@ -7,6 +7,7 @@ Axes: T frames, S cells of a frame, C width, n vocabularies of V codes.
 """
 
 from rsjax.models.roboscape.architecture import Architecture
+from rsjax.models.roboscape.departures.motion_head import OUTPUTS
 
 
 def forward_flops(config: Architecture, frames: int) -> int:
@@ -26,3 +27,10 @@ def forward_flops(config: Architecture, frames: int) -> int:
     if config.action_inputs and config.action_encoder == "mlp":
         encoder += width**2
     return 2 * frames * (cells * per_cell + encoder)
+
+
+def motion_head_flops(config: Architecture, frames: int) -> int:
+    """Returns the operations of the motion head for one clip, which training alone runs; 0 without the head."""
+    if not config.motion_head:
+        return 0
+    return 2 * frames * config.grid**2 * config.width * OUTPUTS

@@ -25,14 +25,15 @@ from rsjax.models.roboscape import masking, objective, pretrained, records
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.branching import TokenBranching
 from rsjax.models.roboscape.departures.action_dropout import dropped_actions
+from rsjax.models.roboscape.departures.motion_head import MotionHead
 from rsjax.models.roboscape.departures.self_conditioning import conditions_itself, previous_frames
 from rsjax.models.roboscape.departures.whole_frames import hidden
-from rsjax.models.roboscape.flops import forward_flops
+from rsjax.models.roboscape.flops import forward_flops, motion_head_flops
 from rsjax.models.roboscape.imagine import TokenImagination
 from rsjax.models.roboscape.objective import Batch
 from rsjax.models.roboscape.sample import Tokens, encode_prompt, rollout, rollout_from
 from rsjax.models.roboscape.teacher_forcing import score_tokens
-from rsjax.models.roboscape.transformer import Transformer, empty_cache, run_transformer
+from rsjax.models.roboscape.transformer import Transformer, empty_cache, run_transformer, run_with_trunk
 from rsjax.tokenizers.codec import Codec
 from rsjax.tokenizers.tokenize import tokenize_store
 from rsjax.trainable import Params, StepContext, Term
@@ -91,6 +92,7 @@ class RoboScape(WorldModel[Batch]):
         no_depth = None if batch.has_depth is None else batch.has_depth == 0
         drop = dropped_actions(departures.action_dropout, key, batch.index)
         network = partial(run_transformer, arch, drop_actions=drop, no_depth=no_depth)
+        network_and_trunk = partial(run_with_trunk, arch, drop_actions=drop, no_depth=no_depth)
         inputs = (corrupted.tokens, mask, batch.actions)
         previous = None
         if departures.self_conditioning:
@@ -98,8 +100,15 @@ class RoboScape(WorldModel[Batch]):
             on = conditions_itself(departures, key, context.step)
             first_pass = partial(network, fixed, *inputs)
             previous = previous_frames(first_pass, corrupted.tokens, arch.code_bits, on, self.prompt_frames)
-        logits, _ = network(params, *inputs, previous=previous)
-        terms = objective.loss_terms(self.config, arch, logits, targets, mask, batch)
+        trunk = None
+        motion: Any = None
+        if self.config.keypoint_term in ("motion", "feature"):
+            logits, trunk = network_and_trunk(params, *inputs, previous=previous)
+        else:
+            logits, _ = network(params, *inputs, previous=previous)
+        if arch.motion_head:
+            motion = MotionHead().apply({"params": params["motion_head"]}, trunk)
+        terms = objective.loss_terms(self.config, arch, logits, targets, mask, batch, trunk, motion)
         return jax.tree.map(lambda x: x.astype("float32"), terms)
 
     def prepare(self, clips: Store, assets: Assets, folder: Path, max_damaged: float) -> Store:
@@ -200,7 +209,7 @@ class RoboScape(WorldModel[Batch]):
 
     def flops(self, frames: int) -> dict[str, int]:
         forward = forward_flops(self.architecture, frames)
-        return {"forward": forward, "train": 3 * forward}
+        return {"forward": forward, "train": 3 * (forward + motion_head_flops(self.architecture, frames))}
 
     def _codec(self, assets: Assets) -> Codec:
         assert assets.tokenizer is not None

@@ -18,7 +18,9 @@ from jaxtyping import Array, Bool, Float, Int, Int32
 from rsjax import clip
 from rsjax.config import RoboScapeConfig, TokenModelConfig
 from rsjax.models.roboscape.architecture import Architecture
-from rsjax.models.roboscape.departures.keypoint_difference import difference, seen_steps
+from rsjax.models.roboscape.departures.keypoint_difference import difference
+from rsjax.models.roboscape.departures.keypoint_features import feature_distance
+from rsjax.models.roboscape.departures.motion_head import motion_error
 from rsjax.models.roboscape.departures.normalised_attention import normalised
 from rsjax.models.roboscape.departures.observed_anchor import anchor
 from rsjax.models.roboscape.departures.visible_keypoints import counted_frames
@@ -68,6 +70,8 @@ def loss_terms(
     targets: dict[str, Int[Array, "B T H W"]],
     mask: Bool[Array, "B T H W"],
     batch: Batch,
+    trunk: Float[Array, "B T S C"] | None = None,
+    motion: Float[Array, "B T S 3"] | None = None,
 ) -> dict[str, Term]:
     """Returns (weighted sum, weight) of every term that is on.
 
@@ -76,6 +80,8 @@ def loss_terms(
         targets: the true tokens, by branch.
         mask: the masked cells, in both branches.
         batch: the clips. Those of weight 0 count nowhere, those without depth not in the depth term.
+        trunk: the RGB branch's features, for the keypoint term "feature".
+        motion: the motion head's outputs, for the keypoint term "motion".
     """
     bits = architecture.code_bits
     grid = architecture.grid
@@ -98,21 +104,16 @@ def loss_terms(
         # T_sample: the K tracks of the largest M_i, on the token grid.
         count = min(config.loss.num_keypoints, batch.tracks.shape[1])
         keypoints = select(batch.tracks, counted_frames(departures, batch.visible), count, grid)
-
-        s_hat = lfq.mean_codes(logits["rgb"], bits)  # B T S D
-        first = anchor(departures, s_hat, targets["rgb"])
-        if config.loss.keypoints == "printed":
+        if config.keypoint_term == "printed":
             # Eq. 5: L_Keypoint = 1/((T-1)K) Σ_i Σ_t≥2 ‖ŝ_t(p_i^t) - ŝ_1(p_i^1)‖².
             cells = keypoints.cells.swapaxes(1, 2)  # B T K
+            s_hat = lfq.mean_codes(logits["rgb"], bits)  # B T S D
+            first = anchor(departures, s_hat, targets["rgb"])
             distance = keypoint_distance(s_hat, first, cells)
-            counts = keypoints.visible.swapaxes(1, 2)[:, 1:]
-        else:
-            cells = token_cells(batch.tracks, grid).swapaxes(1, 2)  # B T N
-            s = lfq.tokens_to_codes(targets["rgb"], bits).reshape(s_hat.shape)
-            distance = difference(jnp.concatenate([first, s_hat[:, 1:]], axis=1), s, cells)
-            counts = seen_steps(batch.visible)
-        counts = counts * batch.weight[:, None, None]
-        terms["keypoint"] = jnp.sum(distance * counts), jnp.sum(counts)
+            counts = keypoints.visible.swapaxes(1, 2)[:, 1:] * batch.weight[:, None, None]
+            terms["keypoint"] = jnp.sum(distance * counts), jnp.sum(counts)
+        elif config.keypoint_term != "none":
+            terms["keypoint"] = other_keypoint_term(config, architecture, logits["rgb"], trunk, motion, batch)
 
         # Eq. 6 and 7: L_Attention = -Σ_t A_t ⊙ s_t log p(ŝ_t). It is divided by the number of cells, not by Σ A.
         attention = attention_map(keypoints, grid, config.loss.gamma)
@@ -123,6 +124,42 @@ def loss_terms(
 
     weights = config.loss_weights
     return {name: term for name, term in terms.items() if name in weights}
+
+
+def other_keypoint_term(
+    config: RoboScapeConfig,
+    architecture: Architecture,
+    logits: Float[Array, "B T S n V"],
+    trunk: Float[Array, "B T S C"] | None,
+    motion: Float[Array, "B T S 3"] | None,
+    batch: Batch,
+) -> Term:
+    """Returns a keypoint term that the paper does not have, as its file in ``departures/`` defines it.
+
+    A point counts only where it is visible.
+    """
+    bits = architecture.code_bits
+    grid = architecture.grid
+    cells = token_cells(batch.tracks, grid).swapaxes(1, 2)  # B T N
+    visible = batch.visible.swapaxes(1, 2)
+    if config.keypoint_term == "difference":
+        s_hat = lfq.mean_codes(logits, bits)
+        s = lfq.tokens_to_codes(batch.rgb, bits).reshape(s_hat.shape)
+        first = anchor(config.departures, s_hat, batch.rgb)
+        errors = difference(jnp.concatenate([first, s_hat[:, 1:]], axis=1), s, cells)
+        counts = visible[:, 1:] & visible[:, :-1]
+    elif config.keypoint_term == "motion":
+        assert motion is not None
+        errors = bits * motion_error(motion, grid * batch.tracks.swapaxes(1, 2), visible, cells)
+        counts = visible[:, :-1]
+    else:
+        assert trunk is not None
+        most = min(config.loss.num_keypoints, batch.tracks.shape[1])
+        moving = select(batch.tracks, batch.visible, most, grid)
+        errors = bits * feature_distance(trunk, moving.cells.swapaxes(1, 2))
+        counts = (moving.visible[..., 1:] & moving.visible[..., :1]).swapaxes(1, 2)
+    counts = counts * batch.weight[:, None, None]
+    return jnp.sum(errors * counts), jnp.sum(counts)
 
 
 def keypoint_distance(

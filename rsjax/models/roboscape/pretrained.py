@@ -26,7 +26,7 @@ ALIKE = {"read_previous", "whole_frames", "rotary", "more_norms"}
 JOINING: tuple[str, ...] = ("blocks/depth_to_rgb/", "action_encoder/", "action_encoder_fc2/", "null_action")
 HEAD_JOINING = ("depth_embed/", "depth_previous_embed/")
 # Fields that may differ.
-FREE = {"action_encoder", "action_inputs", "departures"} | {
+FREE = {"action_encoder", "action_inputs", "motion_head", "departures"} | {
     "compute_dtype",
     "feature_dtype",
     *(field.name for field in fields(TransformerConfig) if field.metadata.get("runtime")),
@@ -84,13 +84,15 @@ def start(fresh: Params, saved: Params, directory: Path) -> Params:
 
     What joins the RGB branch begins at zero: the depth → RGB projection or, with a depth head, the embeddings of depth,
     and the action encoder's last layer. So RGB logits are at first those of the saved model. A saved action encoder is
-    kept; it reads actions normalised for the new data.
+    kept; it reads actions normalised for the new data. A saved motion head that this model lacks is left out.
 
     Raises:
         UserError: this model lacks a saved array, or has it in another shape.
     """
-    params = flatten_dict(saved, sep="/")
     own = flatten_dict(fresh, sep="/")
+    if "motion_head" not in fresh:
+        saved = {name: part for name, part in saved.items() if name != "motion_head"}
+    params = flatten_dict(saved, sep="/")
     for path in params:
         if path not in own:
             raise UserError(f"{directory}: its {path} has no place in this model; keep the branches and the actions")

@@ -26,6 +26,7 @@ from rsjax.layers.platform import attend_in_clip, in_feature_dtype
 from rsjax.layers.unstacked_params import together
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.departures.action_dropout import with_null_action
+from rsjax.models.roboscape.departures.motion_head import MotionHead
 from rsjax.models.roboscape.departures.norms import optional_norm
 from rsjax.models.roboscape.departures.read_previous import absent_cells, frame_before
 from rsjax.models.roboscape.departures.rotary import rotated
@@ -285,6 +286,7 @@ class Transformer(nn.Module):
         )
         new: Any
         x, new = blocks(cfg, name="blocks")(x, together(cache), start)
+        self.sow("trunk", "rgb", x["rgb"].astype(jnp.float32))  # for run_with_trunk; nothing otherwise
         if cache is not None:
             cache = put_frames(cache, new, start, departures.rotary)
         return {name: self._head(name, x.get(name, x["rgb"])) for name in cfg.modalities}, cache
@@ -330,7 +332,11 @@ class Transformer(nn.Module):
         cfg = self.config
         tokens = jnp.zeros((1, 1, cfg.grid, cfg.grid), jnp.int32)
         actions = jnp.zeros((1, 1, cfg.action_inputs))
-        return self.init(key, dict.fromkeys(cfg.modalities, tokens), tokens == 0, actions)["params"]
+        params = self.init(key, dict.fromkeys(cfg.modalities, tokens), tokens == 0, actions)["params"]
+        if cfg.motion_head:
+            features = jnp.zeros((1, 1, 1, cfg.width))
+            params["motion_head"] = MotionHead(parent=None).init(jax.random.fold_in(key, 1), features)["params"]
+        return params
 
 
 def run_transformer(arch: Architecture, params: Params, *inputs: Any, **options: Any) -> Any:
@@ -338,6 +344,19 @@ def run_transformer(arch: Architecture, params: Params, *inputs: Any, **options:
 
     def run(dtype: Any) -> Any:
         return Transformer(replace(arch, feature_dtype=dtype)).apply({"params": params}, *inputs, **options)
+
+    return in_feature_dtype(arch.compute_dtype, run)
+
+
+def run_with_trunk(
+    arch: Architecture, params: Params, *inputs: Any, **options: Any
+) -> tuple[dict[str, Float[Array, "B T S n V"]], Float[Array, "B T S C"]]:
+    """Returns logits as :func:`run_transformer` does, and the float32 features that RGB's head reads."""
+
+    def run(dtype: Any) -> Any:
+        network = Transformer(replace(arch, feature_dtype=dtype))
+        (logits, _), kept = network.apply({"params": params}, *inputs, mutable=["trunk"], **options)
+        return logits, kept["trunk"]["rgb"][0]
 
     return in_feature_dtype(arch.compute_dtype, run)
 

@@ -9,9 +9,11 @@ import pytest
 
 from rsjax.config import PublicCodeConfig
 from rsjax.models.roboscape.architecture import Architecture
-from rsjax.models.roboscape.flops import forward_flops
+from rsjax.models.roboscape.departures.motion_head import MotionHead
+from rsjax.models.roboscape.flops import forward_flops, motion_head_flops
 from rsjax.models.roboscape.transformer import Transformer
 from rsjax.tokenizers.flops import products
+from tests.models.roboscape.toy import roboscape
 
 NARROW = PublicCodeConfig(mlp_ratio=2)
 DUAL = Architecture(frames=5, grid=3, code_bits=8, action_inputs=3, width=32, blocks=3, heads=2)
@@ -47,6 +49,17 @@ def xla_flops(function: Any, *inputs: Any) -> float:
 def test_a_pass_of_the_world_model_is_the_formula_to_the_letter(config: Architecture) -> None:
     logits, params, inputs = world_model(config)
     assert products(jax.make_jaxpr(logits)(params, *inputs).jaxpr) == forward_flops(config, config.frames)
+
+
+def test_a_motion_head_costs_its_formula_in_training_alone() -> None:
+    config = replace(DUAL, motion_head=True)
+    params = jax.eval_shape(Transformer(config).init_params, jax.random.key(0))["motion_head"]
+    features = jax.ShapeDtypeStruct((1, config.frames, config.grid**2, config.width), jnp.float32)
+    head = jax.make_jaxpr(lambda params, x: MotionHead().apply({"params": params}, x))(params, features)
+    cost = motion_head_flops(config, config.frames)
+    assert products(head.jaxpr) == cost > motion_head_flops(DUAL, DUAL.frames) == 0
+    plain = roboscape(DUAL).flops(config.frames)
+    assert roboscape(config).flops(config.frames) == {**plain, "train": plain["train"] + 3 * cost}
 
 
 def test_xla_counts_little_more_for_a_block_of_usual_width() -> None:

@@ -23,6 +23,8 @@ WEIGHT = np.array([1, 1, 0], np.float32)
 CELLS = RNG.integers(0, GRID**2, (B, TRACKS, T))
 TRACKED = ((np.stack([CELLS % GRID, CELLS // GRID], axis=-1) + 0.5) / GRID).astype(np.float32)  # centres of cells
 VISIBLE = RNG.random((B, TRACKS, T)) < 0.7
+FEATURES = RNG.normal(size=(B, T, GRID**2, 8)).astype(np.float32)
+MOTION = RNG.normal(scale=2, size=(B, T, GRID**2, 3)).astype(np.float32)
 TRUE_CODES = np.asarray(lfq.tokens_to_codes(jnp.array(TOKENS), BITS)).reshape(B, T, GRID**2, BITS)
 
 
@@ -32,6 +34,8 @@ def terms(
     tracks: Any = TRACKED,
     visible: Any = VISIBLE,
     departures: Departures = Departures(),  # noqa: B008
+    trunk: Any = FEATURES,
+    motion: Any = MOTION,
     **settings: Any,
 ) -> dict[str, Term]:
     """The terms of the objective with this keypoint term."""
@@ -40,7 +44,8 @@ def terms(
     tokens = jnp.array(TOKENS)
     still = jnp.zeros((B, T, 1))
     batch = Batch(tokens, tokens, still, jnp.array(tracks), jnp.array(visible), jnp.array(WEIGHT), jnp.arange(B))
-    return loss_terms(config, ARCHITECTURE, {"rgb": jnp.array(logits)}, {"rgb": tokens}, jnp.array(MASK), batch)
+    targets = {"rgb": tokens}
+    return loss_terms(config, ARCHITECTURE, {"rgb": jnp.array(logits)}, targets, jnp.array(MASK), batch, trunk, motion)
 
 
 def true_logits() -> np.ndarray:
@@ -92,7 +97,83 @@ def test_any_other_prediction_at_a_visible_step_raises_difference(seed: int) -> 
     assert terms("difference", logits)["keypoint"][0] > 0.01
 
 
-@pytest.mark.parametrize("keypoints", ["difference"])
+def huber(x: float) -> float:
+    return 0.5 * x**2 if abs(x) < 1 else abs(x) - 0.5
+
+
+def test_motion_is_its_equation() -> None:
+    total = count = 0.0
+    for clip in np.flatnonzero(WEIGHT):
+        for i in range(TRACKS):
+            for t in range(1, T):
+                if not VISIBLE[clip, i, t - 1]:
+                    continue
+                x, y, logit = MOTION[clip, t, CELLS[clip, i, t - 1]].astype(np.float64)
+                probability = 1 / (1 + np.exp(-logit))
+                count += 1
+                if VISIBLE[clip, i, t]:
+                    moved = GRID * (TRACKED[clip, i, t] - TRACKED[clip, i, t - 1]).astype(np.float64)
+                    total += huber(x - moved[0]) + huber(y - moved[1]) - np.log(probability)
+                else:
+                    total -= np.log(1 - probability)
+    np.testing.assert_allclose(terms("motion")["keypoint"], (BITS * total, count), rtol=1e-5)
+
+
+def test_the_minimum_of_motion_is_the_true_motion() -> None:
+    """Of one track, so that no two share a cell."""
+    tracks = TRACKED[:, :1]
+    visible = VISIBLE[:, :1]
+    true = np.zeros_like(MOTION)
+    for clip in range(B):
+        for t in range(1, T):
+            true[clip, t, CELLS[clip, 0, t - 1], :2] = GRID * (tracks[clip, 0, t] - tracks[clip, 0, t - 1])
+            true[clip, t, CELLS[clip, 0, t - 1], 2] = 100 if visible[clip, 0, t] else -100
+    assert terms("motion", tracks=tracks, visible=visible, motion=true)["keypoint"][0] < 1e-8
+    other = true + np.float32(0.1)
+    assert terms("motion", tracks=tracks, visible=visible, motion=other)["keypoint"][0] > 0.01
+
+
+def test_feature_is_its_equation_for_the_tracks_that_move_most() -> None:
+    k = 3
+    f = FEATURES.astype(np.float64)
+    f = f - f.mean(axis=2, keepdims=True)
+    f /= np.linalg.norm(f, axis=-1, keepdims=True)
+    total = count = 0.0
+    for clip in np.flatnonzero(WEIGHT):
+        steps = np.linalg.norm(np.diff(TRACKED[clip], axis=1), axis=-1)
+        motion = np.sum(steps * (VISIBLE[clip, :, 1:] & VISIBLE[clip, :, :-1]), axis=1)
+        for i in np.argsort(-motion, kind="stable")[:k]:
+            for t in range(1, T):
+                if VISIBLE[clip, i, 0] and VISIBLE[clip, i, t]:
+                    total += 2 - 2 * f[clip, t, CELLS[clip, i, t]] @ f[clip, 0, CELLS[clip, i, 0]]
+                    count += 1
+    found = terms("feature", num_keypoints=k)["keypoint"]
+    np.testing.assert_allclose(found, (BITS * total, count), rtol=1e-4)
+
+
+def test_the_minimum_of_feature_are_features_that_move_with_the_point_and_neither_zeros_nor_constants() -> None:
+    tracks = TRACKED[:, :1]
+    seen = np.ones((B, 1, T), bool)
+    moving = np.zeros_like(FEATURES)
+    for clip in range(B):
+        for t in range(T):
+            moving[clip, t, CELLS[clip, 0, t]] = FEATURES[clip, 0, 0]
+    value = {
+        name: float(terms("feature", tracks=tracks, visible=seen, trunk=jnp.array(trunk))["keypoint"][0])
+        for name, trunk in {"moving": moving, "zeros": 0 * moving, "constant": 0 * moving + 3}.items()
+    }
+    worst = 2 * BITS * (T - 1) * WEIGHT.sum()
+    assert value["moving"] < 1e-4
+    np.testing.assert_allclose([value["zeros"], value["constant"]], worst, rtol=1e-5)
+
+
+def test_no_gradient_reaches_the_teacher_of_feature() -> None:
+    gradient = jax.grad(lambda x: terms("feature", trunk=x)["keypoint"][0])(jnp.array(FEATURES))
+    assert not np.any(gradient[:, 0])
+    assert np.any(gradient[:, 1:])
+
+
+@pytest.mark.parametrize("keypoints", ["difference", "motion", "feature"])
 def test_a_hidden_point_does_not_count(keypoints: str) -> None:
     moved = np.where(VISIBLE[..., None], TRACKED, 1 - TRACKED)
     np.testing.assert_array_equal(
@@ -102,7 +183,7 @@ def test_a_hidden_point_does_not_count(keypoints: str) -> None:
     assert terms(keypoints, visible=VISIBLE & False)["keypoint"] == (0, 0)
 
 
-@pytest.mark.parametrize("keypoints", ["difference"])
+@pytest.mark.parametrize("keypoints", ["difference", "motion"])
 def test_all_tracks_count_whatever_k(keypoints: str) -> None:
     few = terms(keypoints, num_keypoints=1)
     many = terms(keypoints, num_keypoints=TRACKS)

@@ -15,7 +15,8 @@ from rsjax.models.roboscape.departures.action_dropout import dropped_actions
 from rsjax.models.roboscape.departures.visible_keypoints import counted_frames
 from rsjax.models.roboscape.model import RoboScape
 from rsjax.models.roboscape.objective import Batch, attention_map, select
-from rsjax.models.roboscape.transformer import Transformer
+from rsjax.models.roboscape.transformer import Transformer, run_transformer, run_with_trunk
+from rsjax.tokenizers.flops import products
 from rsjax.trainable import StepContext, Term
 from rsjax.training.step import combine
 from tests.models.roboscape.toy import depart, roboscape
@@ -58,9 +59,9 @@ def random_batch(clips: int = 3) -> Batch:
 
 
 @pytest.mark.parametrize("depth", ["branch", "head", "none"])
-@pytest.mark.parametrize("keypoints", ["none", "printed", "difference"])
+@pytest.mark.parametrize("keypoints", ["none", "printed", "difference", "motion", "feature"])
 def test_what_is_off_has_no_term(depth: Any, keypoints: Any) -> None:
-    model = replace(MODEL, depth=depth)
+    model = replace(MODEL, depth=depth, motion_head=keypoints == "motion")
     loss = replace(LOSS, keypoints=keypoints)
     shapes = jax.eval_shape(Transformer(model).init_params, KEY)
     terms = jax.eval_shape(partial(terms_of, model, loss), shapes, random_batch())
@@ -183,6 +184,37 @@ def test_rgb_terms_teach_the_depth_branch_and_not_the_other_way_round() -> None:
         assert reaches(term, "depth")  # through the projection of Eq. 3
     assert reaches("depth", "depth")
     assert not reaches("depth", "rgb")
+
+
+@pytest.mark.parametrize("keypoints", ["motion", "feature"])
+def test_a_keypoint_term_on_features_teaches_the_trunk_and_not_the_heads_of_tokens(keypoints: Any) -> None:
+    model = replace(MODEL, motion_head=keypoints == "motion")
+    loss = replace(LOSS, keypoints=keypoints)
+    params = random_params(model)
+    batch = random_batch()
+    gradient = jax.jit(jax.grad(lambda params: terms_of(model, loss, params, batch)["keypoint"][0]))(params)
+    for branch in ("rgb", "depth"):  # depth by Eq. 3
+        assert np.any(gradient["blocks"][branch]["fc1"]["kernel"])
+    assert np.any(gradient["action_encoder"]["kernel"])
+    assert not np.any(gradient["rgb_head"]["kernel"])
+    assert ("motion_head" in gradient) == (keypoints == "motion")
+    if keypoints == "motion":
+        assert np.any(gradient["motion_head"]["out"]["kernel"])
+
+
+def test_a_motion_head_changes_no_logit_and_is_not_run_in_sampling() -> None:
+    model = replace(MODEL, motion_head=True)
+    params = random_params(model)
+    plain = {name: part for name, part in params.items() if name != "motion_head"}
+    tokens = {name: jnp.asarray(getattr(random_batch(), name)) for name in MODEL.branches}
+    inputs = (tokens, tokens["rgb"] % 2 == 0, random_batch().actions)
+    programs = [
+        jax.make_jaxpr(partial(run_transformer, model))(params, *inputs),
+        jax.make_jaxpr(partial(run_transformer, MODEL))(plain, *inputs),
+    ]
+    assert len({products(program.jaxpr) for program in programs}) == 1
+    logits = jax.jit(partial(run_with_trunk, model))(params, *inputs)[0]
+    jax.tree.map(np.testing.assert_array_equal, logits, jax.jit(partial(run_transformer, MODEL))(plain, *inputs)[0])
 
 
 def test_training_on_dropped_actions_teaches_the_null_action_and_the_encoder() -> None:

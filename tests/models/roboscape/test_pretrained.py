@@ -130,3 +130,15 @@ def test_a_run_is_such_a_directory_too(tmp_path: Path) -> None:
     assert pretrained.read_architecture(tmp_path) == genie
     begun = begin(replace(genie, depth="branch", action_inputs=5, action_encoder="linear"), tmp_path)
     jax.tree.map(np.testing.assert_array_equal, begun["blocks"]["rgb"], random_params(genie)["blocks"]["rgb"])
+
+
+def test_a_motion_head_begins_fresh_and_a_saved_one_is_left_out_where_there_is_none(tmp_path: Path) -> None:
+    with_head = replace(DUAL, motion_head=True)
+    save(tmp_path / "with", with_head, random_params(with_head))
+    save(tmp_path / "without", DUAL, random_params(DUAL))
+    assert "motion_head" not in begin(DUAL, tmp_path / "with")
+    fresh = random_params(with_head, seed=1)
+    begun = begin(with_head, tmp_path / "without", fresh)
+    jax.tree.map(np.testing.assert_array_equal, begun["motion_head"], fresh["motion_head"])
+    kept = begin(with_head, tmp_path / "with", fresh)
+    jax.tree.map(np.testing.assert_array_equal, kept, random_params(with_head))

@@ -11,7 +11,7 @@ Axes: B clips, T frames, S cells, D code bits, N tracks.
 """
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 
 def difference(
@@ -26,8 +26,3 @@ def difference(
     """
     errors = jnp.take_along_axis(s_hat - s, cells[..., None], axis=2)
     return jnp.sum(jnp.square(errors[:, 1:] - errors[:, :-1]), axis=-1)
-
-
-def seen_steps(visible: Bool[Array, "B N T"]) -> Bool[Array, "B T-1 N"]:
-    """Returns the steps in which each point is visible before and after."""
-    return (visible[..., 1:] & visible[..., :-1]).swapaxes(1, 2)
