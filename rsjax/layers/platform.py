@@ -31,6 +31,11 @@ def by_platform(cpu: Callable[..., Any], accelerator: Callable[..., Any], *opera
     return jax.lax.platform_dependent(*operands, cpu=cpu, default=accelerator)
 
 
+def on_gpu(gpu: Callable[[], Any], other: Callable[[], Any]) -> Any:
+    """Returns ``gpu()`` in a program for an NVIDIA GPU and ``other()`` in one for other platforms."""
+    return jax.lax.platform_dependent(cuda=gpu, default=other)
+
+
 def in_feature_dtype(dtype: str, run: Callable[[str], Any]) -> Any:
     """Returns ``run(dtype)``; in a program for a CPU ``run("float32")``, since features in bf16 are slower there."""
     if dtype == "float32":

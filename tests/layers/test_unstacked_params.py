@@ -1,6 +1,7 @@
 """Blocks that are taken apart for a loop give what stacked ones give."""
 
 from dataclasses import replace
+from functools import partial
 
 import jax
 import numpy as np
@@ -47,3 +48,11 @@ def test_ivideogpt_draws_the_same_tokens() -> None:
     stacked, unrolled = (sample(arch, toy.llama_params(), begin, actions, keys) for arch in archs)
     assert np.ptp(np.asarray(stacked)) > 0
     np.testing.assert_array_equal(stacked, unrolled)
+
+
+def test_a_rollout_on_a_gpu_has_no_loop_over_blocks() -> None:
+    params, (tokens, actions) = random_params(DUAL), given(DUAL, 2)
+    arch = replace(DUAL, compute_dtype="bfloat16")
+    program = jax.jit(partial(rollout, arch, SampleConfig(steps=2))).trace(params, tokens, actions, KEY)
+    text = program.lower(lowering_platforms=("cuda",)).as_text()
+    assert text.count("stablehlo.while") == 3  # over the prompt's blocks, over frames, and over later passes

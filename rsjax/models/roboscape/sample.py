@@ -13,6 +13,7 @@ Axes: B clips, P prompt frames, T frames, F of them generated, K frames kept, HÃ
 frame that the action encoder reads, n vocabularies of V codes, L blocks.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -26,6 +27,7 @@ from jaxtyping import Bool, Float, Int, Key
 from rsjax.clip import Array
 from rsjax.config import SampleConfig
 from rsjax.layers.dense import rounded
+from rsjax.layers.platform import on_gpu
 from rsjax.layers.unstacked_params import apart, together
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.departures import guidance, mean_codes
@@ -497,7 +499,7 @@ def _rollout(
 ) -> Decoded:
     past = tokens["rgb"].shape[1]
     state = start(arch, sample, params, tokens, actions[:, :past], keys, no_depth)
-    return _repeat_step(arch, sample, params, tokens, state, actions[:, past:], frames)
+    return on_each_platform(arch, partial(_repeat_step, sample, params, tokens, state, actions[:, past:], frames))
 
 
 @partial(jax.jit, static_argnums=(0, 1))
@@ -533,17 +535,17 @@ def _continue(
         key=keys,
         no_depth=None if state.no_depth is None else repeated(state.no_depth),
     )
-    return _repeat_step(arch, sample, params, tokens, state, actions, frames)
+    return on_each_platform(arch, partial(_repeat_step, sample, params, tokens, state, actions, frames))
 
 
 def _repeat_step(
-    arch: Architecture,
     sample: SampleConfig,
     params: Params,
     prompt: dict[str, Int[Array, "B P S"]],
     state: State,
     actions: Float[Array, "B F A"],
     frames: Int[Array, ""],
+    arch: Architecture,
 ) -> Decoded:
     """Generates frames P to ``frames`` - 1 by repeated :func:`step`."""
     past = prompt["rgb"].shape[1]
@@ -612,6 +614,25 @@ def _recomputed(
 
     tokens, means = jax.lax.fori_loop(past, frames, next_frame, (tokens, means))
     return _grids(arch, means or tokens, no_depth)
+
+
+def on_each_platform(arch: Architecture, run: Callable[[Architecture], Any]) -> Any:
+    """Returns ``run(arch)``; in a program for a GPU, :func:`for_gpu` of it if products are bf16."""
+    written_out = for_gpu(arch)
+    if written_out == arch:
+        return run(arch)
+    return on_gpu(partial(run, written_out), partial(run, arch))
+
+
+def for_gpu(arch: Architecture) -> Architecture:
+    """Returns the settings of a generating program for a GPU: all blocks are written out, not scanned over.
+
+    A scan would copy each block's parameters and cache out of their stacks in every pass. For few clips these kernels
+    would take longer, by their launches alone, than all others.
+    """
+    if arch.compute_dtype != "bfloat16":
+        return arch
+    return replace(arch, unroll=arch.blocks)
 
 
 def for_many_passes(arch: Architecture, params: Params) -> Params:
