@@ -84,6 +84,29 @@ def attend_few(
     return jnp.concatenate(outs, axis=-2)
 
 
+def attend_cached(
+    qkv: Float[Array, "B T S 3 h e"], cache: KeyValues, start: Any, window: int
+) -> Float[Array, "B T S h e"]:
+    """Returns :func:`attend` of each cell over itself in the frames of a cache and the new ones up to its own.
+
+    Args:
+        qkv: of frames start … start + T - 1.
+        cache: of frames before ``start``, frame f in slot f mod N; later frames in it are not read.
+        window: the number of frames that a query sees, its own included.
+    """
+    positions = start + jnp.arange(qkv.shape[1])
+    held = frames_held(cache.k.shape[-2], start - 1)
+    q, k, v = (x.transpose(0, 2, 3, 1, 4) for x in unpacked(qkv))  # B S h T e
+    parts = [(cache, sees(positions, held, window)), (KeyValues(k, v), sees(positions, positions, window))]
+    return attend_few(q, parts).transpose(0, 3, 1, 2, 4).astype(qkv.dtype)
+
+
+def sees(queries: Int[Array, " q"], keys: Int[Array, " k"], window: int) -> Bool[Array, "q k"]:
+    """Returns whether a query sees a key: of its own frame or the ``window - 1`` before it; negative ones are empty."""
+    age = queries[:, None] - keys[None, :]
+    return (age >= 0) & (age < window) & (keys >= 0)
+
+
 def rotate(x: Float[Array, "B T S h e"], positions: Int[Array, " T"]) -> Float[Array, "B T S h e"]:
     """Applies rotary position embedding: rotates channels i and i + e/2 by position · 10000^(-2i/e), in float32.
 

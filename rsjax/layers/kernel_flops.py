@@ -30,6 +30,18 @@ def attention(qkv: tuple[int, ...], log_sum: tuple[int, ...], of_all_lanes: int,
     return 2 * clips * tiles * heads * rows**2 * (of_all_lanes * lanes + of_head * width)
 
 
+def over_cache(qkv: tuple[int, ...], keys: tuple[int, ...]) -> int:
+    """Returns the operations of attention over a cache: each query's with all slots and the new frames up to its own.
+
+    Args:
+        qkv: shape (B, F, S, 3, h, e).
+        keys: shape (B, S, h, N, e).
+    """
+    clips, frames, cells, _, heads, width = qkv
+    pairs = frames * keys[3] + frames * (frames + 1) // 2
+    return 4 * clips * cells * heads * pairs * width
+
+
 def products(rows: tuple[int, ...], kernel: tuple[int, ...], count: int) -> int:
     """Returns the operations of so many products of rows (N, C) and a kernel (C, H) or its transpose."""
     return count * 2 * rows[0] * prod(kernel)
@@ -42,6 +54,7 @@ KERNEL_FLOPS: dict[str, Callable[[Shapes, Shapes], int]] = {
     "attend_cells_backward": lambda operands, results: attention(operands[0], operands[3], 2, 3),
     "attend_frames_forward": lambda operands, results: attention(operands[0], results[1], 1, 1),
     "attend_frames_backward": lambda operands, results: attention(operands[0], operands[3], 2, 3),
+    "attend_cache": lambda operands, results: over_cache(operands[0], operands[1]),
     "mlp_forward": lambda operands, results: products(operands[0], operands[1], 2),
     "mlp_backward": lambda operands, results: products(operands[0], operands[2], 3),
     "feed_forward_forward": lambda operands, results: products(operands[0], operands[1], 1),

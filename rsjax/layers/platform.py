@@ -16,10 +16,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rsjax.layers import accelerator
-from rsjax.layers.attention import attend, unpacked
+from rsjax.layers.attention import KeyValues, attend, attend_cached, unpacked
 from rsjax.layers.cpu import convolution, frame_attention
 from rsjax.layers.cpu import matmul as cpu_matmul
 from rsjax.layers.gpu import attention as gpu
+from rsjax.layers.gpu import cached_attention as gpu_cached
 from rsjax.layers.gpu import feed_forward as gpu_feed_forward
 from rsjax.layers.gpu import mlp as gpu_mlp
 from rsjax.layers.partition import devices_are_known
@@ -66,6 +67,24 @@ def attend_in_clip(
     if qkv.dtype == jnp.bfloat16 and tpu.fits(qkv.shape, over) and devices_are_known():
         kernels["tpu"] = partial(tpu.attend, over=over)
     return jax.lax.platform_dependent(qkv, default=plain, **kernels)
+
+
+def attend_over_cache(
+    qkv: Float[Array, "B T S 3 h e"], cache: KeyValues, start: Any, window: int
+) -> Float[Array, "B T S h e"]:
+    """Returns :func:`rsjax.layers.attention.attend_cached`; GPUs do it by one kernel if all is bf16 and fits.
+
+    The kernel has no gradient.
+    """
+    plain = partial(attend_cached, window=window)
+    are_bf16 = qkv.dtype == cache.k.dtype == jnp.bfloat16
+    if not are_bf16 or not gpu_cached.fits(qkv.shape, cache.k.shape[-2]):
+        return plain(qkv, cache, start)
+
+    def kernel(qkv: Array, cache: KeyValues, start: Any) -> Array:
+        return gpu_cached.attend(qkv, cache.k, cache.v, start, window)
+
+    return jax.lax.platform_dependent(qkv, cache, start, cuda=kernel, default=plain)
 
 
 def mlp(

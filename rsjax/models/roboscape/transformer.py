@@ -17,12 +17,12 @@ import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float, Int
 
-from rsjax.layers.attention import KeyValues, attend, attend_few, frames_held, packed, put_frames, unpacked
+from rsjax.layers.attention import KeyValues, attend, packed, put_frames, sees, unpacked
 from rsjax.layers.dense import PRODUCT, Dense, NormParameters, layer_norm
 from rsjax.layers.gelu import gelu
 from rsjax.layers.mlp import mlp
 from rsjax.layers.partition import gathers
-from rsjax.layers.platform import attend_in_clip, in_feature_dtype
+from rsjax.layers.platform import attend_in_clip, attend_over_cache, in_feature_dtype
 from rsjax.layers.unstacked_params import together
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.departures.action_dropout import with_null_action
@@ -120,21 +120,15 @@ class Attention(nn.Module):
         q, k, v = unpacked(qkv)
         if cache is None:
             q, k, v = (y.swapaxes(1, 2) for y in (q, k, v))
-            out = attend(q, k, v, self._sees(positions, positions)).swapaxes(1, 2)
+            out = attend(q, k, v, sees(positions, positions, cfg.frames)).swapaxes(1, 2)
             return self.proj(out.reshape(x.shape)), None
         frames = x.shape[1]
         slots = cache.k.shape[-2]
         if frames > slots:
             raise ValueError(f"{frames} frames do not fit a cache of {slots}")
-        q, k, v = (y.transpose(0, 2, 3, 1, 4) for y in (q, k, v))  # B S h T e
-        new = KeyValues(k, v)
-        sees = (self._sees(positions, frames_held(slots, start - 1)), self._sees(positions, positions))
-        out = attend_few(q, [(cache, sees[0]), (new, sees[1])]).transpose(0, 3, 1, 2, 4).astype(x.dtype)
+        out = attend_over_cache(qkv, cache, start, cfg.frames)
+        new = KeyValues(*(y.transpose(0, 2, 3, 1, 4) for y in (k, v)))  # B S h T e
         return self.proj(out.reshape(x.shape)), new
-
-    def _sees(self, queries: Int[Array, " q"], keys: Int[Array, " k"]) -> Bool[Array, "q k"]:
-        age = queries[:, None] - keys[None, :]
-        return (age >= 0) & (age < self.config.frames) & (keys >= 0)
 
     def _project(self, x: Float[Array, "B T S C"]) -> Float[Array, "B T S 3 h e"]:
         cfg = self.config
