@@ -7,7 +7,8 @@ import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float
 
-from rsjax.layers.platform import linear
+from rsjax.layers.gpu.norm import Norm
+from rsjax.layers.platform import linear, norm_linear
 
 # torch's default for linear layers, U(±1/√fan_in), as in the public code.
 Params: TypeAlias = dict[str, Any]  # a tree of arrays
@@ -28,8 +29,12 @@ class Dense(nn.Module):
     use_bias: bool = True
     kernel_init: nn.initializers.Initializer = TORCH_KERNEL
 
-    def __call__(self, x: Float[Array, "*N K"]) -> Float[Array, "*N M"]:
-        return dense(x, *self.parameters(x.shape[-1]), self.bf16)
+    def __call__(self, x: Float[Array, "*N K"], norm: Norm | None = None) -> Float[Array, "*N M"]:
+        """Returns the layer's output for x, or for the LayerNorm of x with these parameters."""
+        parameters = self.parameters(x.shape[-1])
+        if norm is None:
+            return dense(x, *parameters, self.bf16)
+        return norm_dense(x, norm, *parameters, self.bf16)
 
     @nn.compact
     def parameters(self, inputs: int) -> tuple[Float[Array, "K M"], Any]:
@@ -50,11 +55,35 @@ def dense(
     x: Float[Array, "*N K"], kernel: Float[Array, "K M"], bias: Float[Array, " M"] | None, bf16: bool
 ) -> Float[Array, "*N M"]:
     """Returns the output of :class:`Dense` with these parameters."""
+    return checkpoint_name(_dense(x, kernel, bias, bf16), PRODUCT)
+
+
+def _dense(x: Array, kernel: Array, bias: Array | None, bf16: bool) -> Array:
     if bf16:
-        out = linear(x.reshape(-1, x.shape[-1]), kernel, bias).reshape(*x.shape[:-1], kernel.shape[1])
+        return linear(x.reshape(-1, x.shape[-1]), kernel, bias).reshape(*x.shape[:-1], kernel.shape[1])
+    return x @ kernel if bias is None else x @ kernel + bias
+
+
+def norm_dense(
+    x: Float[Array, "*N K"], norm: Norm, kernel: Float[Array, "K M"], bias: Float[Array, " M"] | None, bf16: bool
+) -> Float[Array, "*N M"]:
+    """Returns :func:`dense` of the LayerNorm of x."""
+
+    def layers(x: Array, norm: Norm, kernel: Array) -> Array:
+        return _dense(normalised(x, norm), kernel, bias, bf16)
+
+    if bf16 and bias is None:
+        out = norm_linear(x, norm, kernel, layers)
     else:
-        out = x @ kernel if bias is None else x @ kernel + bias
+        out = layers(x, norm, kernel)
     return checkpoint_name(out, PRODUCT)
+
+
+def normalised(x: Float[Array, "*N C"], norm: Norm) -> Float[Array, "*N C"]:
+    """Returns the LayerNorm of x with these parameters, in the number format of x; its statistics are float32."""
+    parameters = dict(zip(("scale", "bias"), norm, strict=True))
+    normed: Any = nn.LayerNorm(EPSILON, x.dtype, parent=None).apply({"params": parameters}, x)
+    return normed
 
 
 def rounded(params: Params) -> Params:

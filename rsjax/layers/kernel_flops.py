@@ -55,6 +55,7 @@ KERNEL_FLOPS: dict[str, Callable[[Shapes, Shapes], int]] = {
     "attend_frames_forward": lambda operands, results: attention(operands[0], results[1], 1, 1),
     "attend_frames_backward": lambda operands, results: attention(operands[0], operands[3], 2, 3),
     "attend_cache": lambda operands, results: over_cache(operands[0], operands[1]),
+    "norm_linear": lambda operands, results: products(operands[0], operands[1], 1),
     "mlp_forward": lambda operands, results: products(operands[0], operands[1], 2),
     "mlp_backward": lambda operands, results: products(operands[0], operands[2], 3),
     "feed_forward_forward": lambda operands, results: products(operands[0], operands[1], 1),

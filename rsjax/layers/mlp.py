@@ -1,15 +1,12 @@
 """The MLP of a transformer block: LayerNorm, two linear layers with a GELU between them, and the residual sum."""
 
-from functools import partial
-from typing import Any
-
-import flax.linen as nn
 from jaxtyping import Array, Float
 
 from rsjax.layers import platform
-from rsjax.layers.dense import EPSILON, dense
+from rsjax.layers.dense import dense, normalised
 from rsjax.layers.gelu import gelu
-from rsjax.layers.gpu.mlp import Linear, Norm
+from rsjax.layers.gpu.mlp import Linear
+from rsjax.layers.gpu.norm import Norm
 
 
 def mlp(x: Float[Array, "B T S C"], norm: Norm | None, fc1: Linear, fc2: Linear, bf16: bool) -> Float[Array, "B T S C"]:
@@ -18,18 +15,16 @@ def mlp(x: Float[Array, "B T S C"], norm: Norm | None, fc1: Linear, fc2: Linear,
     Args:
         bf16: whether products may round their operands to bf16.
     """
-    layers = partial(_layers, bf16=bf16)
-    return platform.mlp(x, norm, fc1, fc2, layers) if bf16 else layers(x, norm, fc1, fc2)
 
+    def feed_forward(x: Array, fc1: Linear, fc2: Linear) -> Array:
+        return dense(gelu(dense(x, *fc1, bf16)), *fc2, bf16)
 
-def _layers(x: Array, norm: Norm | None, fc1: Linear, fc2: Linear, bf16: bool) -> Array:
-    normed: Any = x
-    if norm is not None:
-        parameters = dict(zip(("scale", "bias"), norm, strict=True))
-        normed = nn.LayerNorm(EPSILON, x.dtype, parent=None).apply({"params": parameters}, x)
-    layers = partial(_feed_forward, bf16=bf16)
-    return x + (platform.feed_forward(normed, fc1, fc2, layers) if bf16 else layers(normed, fc1, fc2))
+    def layers(x: Array, norm: Norm | None, fc1: Linear, fc2: Linear) -> Array:
+        normed = x if norm is None else normalised(x, norm)
+        if bf16:
+            return x + platform.feed_forward(normed, fc1, fc2, feed_forward)
+        return x + feed_forward(normed, fc1, fc2)
 
-
-def _feed_forward(x: Array, fc1: Linear, fc2: Linear, bf16: bool) -> Array:
-    return dense(gelu(dense(x, *fc1, bf16)), *fc2, bf16)
+    if bf16:
+        return platform.mlp(x, norm, fc1, fc2, layers)
+    return layers(x, norm, fc1, fc2)

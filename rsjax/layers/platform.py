@@ -23,6 +23,8 @@ from rsjax.layers.gpu import attention as gpu
 from rsjax.layers.gpu import cached_attention as gpu_cached
 from rsjax.layers.gpu import feed_forward as gpu_feed_forward
 from rsjax.layers.gpu import mlp as gpu_mlp
+from rsjax.layers.gpu import norm_linear as gpu_norm_linear
+from rsjax.layers.gpu.norm import Norm
 from rsjax.layers.partition import devices_are_known
 from rsjax.layers.tpu import attention as tpu
 
@@ -89,7 +91,7 @@ def attend_over_cache(
 
 def mlp(
     x: Float[Array, "B T S C"],
-    norm: gpu_mlp.Norm | None,
+    norm: Norm | None,
     fc1: gpu_mlp.Linear,
     fc2: gpu_mlp.Linear,
     layers: Callable[..., Float[Array, "B T S C"]],
@@ -116,6 +118,28 @@ def feed_forward(
     if x.dtype != jnp.bfloat16 or not gpu_feed_forward.fits(x.shape, fc1[0].shape[1]):
         return layers(x, fc1, fc2)
     return jax.lax.platform_dependent(x, fc1, fc2, cuda=gpu_feed_forward.feed_forward, default=layers)
+
+
+def norm_linear(
+    x: Float[Array, "B T S C"],
+    norm: Norm,
+    kernel: Float[Array, "C D"],
+    layers: Callable[..., Float[Array, "B T S D"]],
+) -> Float[Array, "B T S D"]:
+    """Returns ``layers(x, norm, kernel)``, layer_norm(x)·kernel; GPUs do it by one kernel if x is bf16 and fits.
+
+    Gradients are those of ``layers``, which a backward pass computes again.
+    """
+    if x.dtype != jnp.bfloat16 or not gpu_norm_linear.fits(x.shape, kernel.shape[1]):
+        return layers(x, norm, kernel)
+
+    @jax.custom_vjp
+    def run(*operands: Any) -> Any:
+        return jax.lax.platform_dependent(*operands, cuda=gpu_norm_linear.norm_linear, default=layers)
+
+    run.defvjp(lambda *operands: jax.vjp(layers, *operands), lambda pull, cotangent: pull(cotangent))
+    out: Array = run(x, norm, kernel)
+    return out
 
 
 def linear(

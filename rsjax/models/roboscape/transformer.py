@@ -20,6 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 from rsjax.layers.attention import KeyValues, attend, packed, put_frames, sees, unpacked
 from rsjax.layers.dense import PRODUCT, Dense, NormParameters, layer_norm
 from rsjax.layers.gelu import gelu
+from rsjax.layers.gpu.norm import Norm
 from rsjax.layers.mlp import mlp
 from rsjax.layers.partition import gathers
 from rsjax.layers.platform import attend_in_clip, attend_over_cache, in_feature_dtype
@@ -86,9 +87,9 @@ class Attention(nn.Module):
         if cfg.public.qk_norm:
             self.norm = layer_norm(None, cfg.feature_dtype)
 
-    def spatial(self, x: Float[Array, "B T S C"]) -> Float[Array, "B T S C"]:
-        """Lets every cell attend to all cells of its frame."""
-        out = attend_in_clip(self._project(x), "cells", self.config.compute_dtype == "bfloat16")
+    def spatial(self, x: Float[Array, "B T S C"], norm: Norm | None) -> Float[Array, "B T S C"]:
+        """Lets every cell attend to all cells of its frame, after a LayerNorm with these parameters."""
+        out = attend_in_clip(self._project(x, norm), "cells", self.config.compute_dtype == "bfloat16")
         return self.proj(out.reshape(x.shape))
 
     def temporal(
@@ -130,9 +131,9 @@ class Attention(nn.Module):
         new = KeyValues(*(y.transpose(0, 2, 3, 1, 4) for y in (k, v)))  # B S h T e
         return self.proj(out.reshape(x.shape)), new
 
-    def _project(self, x: Float[Array, "B T S C"]) -> Float[Array, "B T S 3 h e"]:
+    def _project(self, x: Float[Array, "B T S C"], norm: Norm | None = None) -> Float[Array, "B T S 3 h e"]:
         cfg = self.config
-        qkv = self.qkv(x).reshape(*x.shape[:-1], 3, cfg.heads, cfg.head_width)
+        qkv = self.qkv(x, norm).reshape(*x.shape[:-1], 3, cfg.heads, cfg.head_width)
         if not (cfg.public.qk_norm or cfg.public.mup):
             return qkv
         q, k, v = unpacked(qkv)
@@ -158,8 +159,8 @@ class STBlock(nn.Module):
     def __call__(self, x: Features, start: Any, cache: KeyValues | None) -> tuple[Features, KeyValues | None]:
         cfg = self.config
         bf16 = cfg.compute_dtype == "bfloat16"
-        normed = optional_norm(not cfg.public.qk_norm, "norm1", x)
-        x = x + Attention(cfg, name="spatial_attn").spatial(normed)
+        norm = None if cfg.public.qk_norm else NormParameters(name="norm1")(cfg.width)
+        x = x + Attention(cfg, name="spatial_attn").spatial(x, norm)
         normed = optional_norm(cfg.departures.more_norms, "norm_temporal", x)
         out, cache = Attention(cfg, name="temporal_attn").temporal(normed, start, cache)
         x = x + out
