@@ -86,13 +86,21 @@ def normalised(x: Float[Array, "*N C"], norm: Norm) -> Float[Array, "*N C"]:
     return normed
 
 
-def rounded(params: Params) -> Params:
-    """Rounds the kernels of linear layers to bf16, as they do themselves in every pass."""
+def rounded(params: Params, biases: tuple[str, ...] = ()) -> Params:
+    """Rounds the kernels of linear layers to bf16, as they do themselves in every pass.
+
+    Args:
+        biases: names of layers whose biases are rounded too, as :func:`rsjax.layers.accelerator.linear` does for bf16
+            features.
+    """
     if "kernel" in params:
         return params | {"kernel": params["kernel"].astype(jnp.bfloat16)}
     if "scale" in params:
         return params
-    return {name: rounded(inner) for name, inner in params.items()}
+    tree = {name: rounded(inner, biases) for name, inner in params.items()}
+    for name in tree.keys() & biases:
+        tree[name] |= {"bias": tree[name]["bias"].astype(jnp.bfloat16)}
+    return tree
 
 
 def layer_norm(name: str | None, dtype: Any = jnp.float32) -> nn.LayerNorm:

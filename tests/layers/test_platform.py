@@ -65,3 +65,21 @@ def test_weights_that_are_rounded_once_give_what_layers_that_round_them_give() -
         layer.apply({"params": params}, x),  # type: ignore[arg-type]
     )
     assert once["norm"] is tree["norm"]
+
+
+def test_on_accelerators_biases_that_are_rounded_once_change_nothing_for_bf16_features() -> None:
+    x = numbers(5, 8).astype(jnp.bfloat16)
+    tree = {
+        "block": {
+            "proj": {"kernel": numbers(8, 4), "bias": numbers(4)},
+            "fc1": {"kernel": numbers(4, 3), "bias": numbers(3)},
+        }
+    }
+    once = rounded(tree, biases=("proj",))["block"]["proj"]
+    assert {array.dtype for array in once.values()} == {jnp.dtype(jnp.bfloat16)}
+    assert rounded(tree, biases=("proj",))["block"]["fc1"]["bias"].dtype == jnp.float32
+    each_time = tree["block"]["proj"]
+    np.testing.assert_array_equal(
+        accelerator.linear(x, once["kernel"], once["bias"]),
+        accelerator.linear(x, each_time["kernel"], each_time["bias"]),
+    )

@@ -35,6 +35,8 @@ from rsjax.models.roboscape.maskgit import Frame, unmask_step
 from rsjax.models.roboscape.transformer import Cache, Cells, StackedCache, empty_cache, run_transformer
 from rsjax.trainable import Params
 
+ADDED_IN_BF16 = ("proj", "depth_to_rgb")  # layers that add their bias to features; the MLP's kernel adds it in float32
+
 Tokens = dict[str, Int[Array, "B T H W"]]
 Decoded = dict[str, Int[Array, "B T H W"] | Float[Array, "B T H W D"]]  # tokens, or codes if ``sample.shows_means``
 
@@ -632,14 +634,14 @@ def for_gpu(arch: Architecture) -> Architecture:
     """
     if arch.compute_dtype != "bfloat16":
         return arch
-    return replace(arch, unroll=arch.blocks)
+    return replace(arch, unroll=arch.blocks, feature_dtype="bfloat16")
 
 
 def for_many_passes(arch: Architecture, params: Params) -> Params:
     """Returns the parameters as a loop around the network reads them fastest: rounded once, and blocks split."""
     blocks = params["blocks"]
     if arch.compute_dtype == "bfloat16":
-        blocks = rounded(blocks)
+        blocks = rounded(blocks, ADDED_IN_BF16 if arch.feature_dtype == "bfloat16" else ())
     return params | {"blocks": apart(blocks, arch.blocks, arch.unroll)}
 
 
