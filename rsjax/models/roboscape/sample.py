@@ -191,6 +191,9 @@ def _decode_frame(
     entropy = None if state.entropy is None else jnp.zeros((clips, cells))
     frame = Frame(undecided, mask[:, 1], entropy, mean_codes.codes_of(sample, undecided, arch.code_bits))
     frame = unmask(keys[:, 0], 0, frame, {branch: x[:, -1] for branch, x in logits.items()})
+    # Without the barrier a second pass's depth branch need not wait for the first pass's RGB, and XLA multiplies the
+    # features of both passes by one kernel of depth_to_rgb, which takes a copy and two sums more than two products.
+    frame = jax.lax.optimization_barrier(frame)
 
     def later_pass(number: Array, frame: Frame) -> Frame:
         seen = {branch: x[:, None] for branch, x in mean_codes.read(sample, frame.tokens, frame.means).items()}
