@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from experiments.cli import main_errors, parse_options
+from rsjax.config import require
 from rsjax.errors import UserError
 
 PROG = "python -m experiments.results"
@@ -14,6 +15,12 @@ PROG = "python -m experiments.results"
 class Options:
     """Makes the tables of docs/results and of the README anew from the files in docs/results/data."""
 
+    add: tuple[str, ...] = ()
+    """First copy what a study has measured for these claims."""
+    study: Path = Path("runs/paper")
+    """The directory of experiments.paper that --add takes the claims from."""
+    name: str = ""
+    """The name of the file that --add writes, if it is not the claim's: table1-multitask."""
     check: bool = False
     """Change nothing; name each table that differs from its file, and exit with 2 if there is any."""
 
@@ -25,6 +32,9 @@ def main() -> None:
     from rsjax.tools.studies import result_pages
 
     root = Path(__file__).resolve().parents[1]
+    require(not options.name or len(options.add) == 1, "--name names the file of one claim; --add has another number")
+    for claim in options.add:
+        print(result_pages.add_result(root, options.study, claim, options.name))
     if options.check:
         differing = list(result_pages.differences(root))
         if differing:

@@ -1,6 +1,6 @@
 """Means over clips and seeds with their intervals, tests of differences, and verdicts on claims."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Literal
@@ -12,7 +12,7 @@ from scipy.special import ndtri, stdtr, stdtrit
 
 Statistic = Literal["mean", "median"]
 Direction = Literal["higher", "lower"]
-Verdict = Literal["holds", "does not hold", "cannot tell"]
+Verdict = Literal["holds", "does not hold", "equal", "cannot tell"]
 
 
 _SUMMARIES: dict[Statistic, Callable[..., Any]] = {"mean": np.mean, "median": np.median}
@@ -142,25 +142,83 @@ def _estimate(value: float, resampled: Float[np.ndarray, " R"], level: float) ->
     return Estimate(float(value), float(low), float(high))
 
 
+def nested_bootstrap(
+    a: Sequence[Float[np.ndarray, " _"]],
+    b: Sequence[Float[np.ndarray, " _"]],
+    seed: int = 0,
+    level: float = 0.95,
+    resamples: int = 10_000,
+    statistic: Statistic = "mean",
+) -> Estimate:
+    """Returns the score of a minus that of b, and its interval, where every seed has clips of its own.
+
+    A score is the mean over seeds of each seed's mean or median over clips. Seeds are paired, since both trained and
+    were scored on the same clips: each resample draws clips of every seed, as many as it has, and then S of the seeds.
+
+    Args:
+        a, b: for each of S seeds, one finite number per clip; the same seeds and clips in the same order.
+        seed, level, resamples, statistic: as in :func:`bootstrap`.
+
+    Raises:
+        ValueError: a and b differ in their seeds or clips, or a value is not finite.
+    """
+    if not a or len(a) != len(b) or any(len(one) != len(other) for one, other in zip(a, b, strict=True)):
+        raise ValueError(f"a nested interval needs the same seeds and clips, not {len(a)} and {len(b)} seeds")
+    summarise = _SUMMARIES[statistic]
+    value = float(np.mean([summarise(one) - summarise(other) for one, other in zip(a, b, strict=True)]))
+    if max(map(len, a)) == 1:
+        return Estimate(value, None, None)
+    by_seed = []
+    for number, pair in enumerate(zip(a, b, strict=True)):
+        one, other = (np.asarray(each, np.float64)[None] for each in pair)
+        if not (np.isfinite(one).all() and np.isfinite(other).all()):
+            raise ValueError("a nested interval needs a finite number per seed and clip")
+        key = seed + number  # both arms share the drawn clips
+        by_seed.append(_resampled(one, key, resamples, statistic) - _resampled(other, key, resamples, statistic))
+    differences = np.concatenate(by_seed, axis=1)
+    shares = _share_of_seeds(len(a), resamples, np.random.default_rng([seed, 1]))
+    return _estimate(value, (shares * differences).sum(1), level)
+
+
 @dataclass(frozen=True)
-class Welch:
-    """Welch's t-test of two means, and the interval of their difference.
+class TTest:
+    """A t-test of the difference of two means, and its interval.
 
     Attributes:
         difference: the mean of a minus the mean of b, with its t interval.
-        t: the statistic; ±inf where neither group varies and the means differ.
-        df: Welch–Satterthwaite degrees of freedom.
+        t: the statistic; ±inf where nothing varies and the means differ.
+        df: degrees of freedom.
         p: the two-sided p-value.
+        error: the standard error of the difference.
     """
 
     difference: Estimate
     t: float
     df: float
     p: float
+    error: float
+
+    def p_of(self, value: float) -> float:
+        """Returns the two-sided p-value of the hypothesis that the difference is this value."""
+        distance = abs(self.difference.value - value)
+        if not self.error:
+            return float(distance == 0)
+        return float(2 * stdtr(self.df, -distance / self.error))
+
+    def p_beyond(self, margin: float) -> float:
+        """Returns the p-value of the hypothesis that the difference is at least as large as a margin, either way.
+
+        It is the larger of two one-sided tests (Schuirmann, 1987). Where it is small, the two are equal within the
+        margin.
+        """
+        room = margin - abs(self.difference.value)  # to the nearer bound, which has the larger p-value
+        if not self.error:
+            return float(room <= 0)
+        return float(stdtr(self.df, -room / self.error))
 
 
-def welch(a: Float[np.ndarray, " S"], b: Float[np.ndarray, " Z"], level: float = 0.95) -> Welch | None:
-    """Tests whether the means of two groups of seeds differ; their variances may differ.
+def welch(a: Float[np.ndarray, " S"], b: Float[np.ndarray, " Z"], level: float = 0.95) -> TTest | None:
+    """Tests by Welch's t-test whether the means of two groups of seeds differ; their variances may differ.
 
     Returns None if a group has fewer than two seeds.
 
@@ -171,21 +229,40 @@ def welch(a: Float[np.ndarray, " S"], b: Float[np.ndarray, " Z"], level: float =
     b = np.asarray(b, np.float64)
     if min(len(a), len(b)) < 2:
         return None
-    difference = float(a.mean() - b.mean())
     parts = (a.var(ddof=1) / len(a), b.var(ddof=1) / len(b))
     error = float(np.sqrt(sum(parts)))
-    if not error:
-        same = difference == 0
-        interval = Estimate(difference, difference, difference)
-        return Welch(
-            interval, 0.0 if same else float(np.copysign(np.inf, difference)), len(a) + len(b) - 2.0, float(same)
-        )
-    df = error**4 / (parts[0] ** 2 / (len(a) - 1) + parts[1] ** 2 / (len(b) - 1))
-    t = difference / error
+    df = len(a) + len(b) - 2.0
+    if error:
+        df = float(error**4 / (parts[0] ** 2 / (len(a) - 1) + parts[1] ** 2 / (len(b) - 1)))
+    return _t_test(float(a.mean() - b.mean()), error, df, level)
+
+
+def paired_t(a: Float[np.ndarray, " S"], b: Float[np.ndarray, " S"], level: float = 0.95) -> TTest | None:
+    """Tests whether the mean of the seeds' differences is 0, for seeds that share what varies among them, as clips.
+
+    Returns None with fewer than two seeds.
+
+    Args:
+        a, b: one number per seed; the same seeds in the same order.
+    """
+    differences = np.asarray(a, np.float64) - np.asarray(b, np.float64)
+    if len(differences) < 2:
+        return None
+    error = float(differences.std(ddof=1) / np.sqrt(len(differences)))
+    return _t_test(float(differences.mean()), error, len(differences) - 1.0, level)
+
+
+def _t_test(difference: float, error: float, df: float, level: float) -> TTest:
+    """Returns the test of a difference with this standard error; without any error, only equality has p = 1."""
     half = float(stdtrit(df, (1 + level) / 2)) * error
-    return Welch(
-        Estimate(difference, difference - half, difference + half), t, float(df), float(2 * stdtr(df, -abs(t)))
-    )
+    interval = Estimate(difference, difference - half, difference + half)
+    if error:
+        t = difference / error
+    elif difference:
+        t = float(np.copysign(np.inf, difference))
+    else:
+        t = 0.0
+    return TTest(interval, t, df, float(2 * stdtr(df, -abs(t))), error)
 
 
 def holm(p: ArrayLike) -> Float[np.ndarray, " M"]:
@@ -218,7 +295,7 @@ def wilson(successes: int, trials: int, level: float = 0.95) -> Estimate:
     return Estimate(share, float(max(0, (centre - half) / scale)), float(min(1, (centre + half) / scale)))
 
 
-def share_difference(one: ArrayLike, other: ArrayLike) -> Estimate:
+def share_difference(one: ArrayLike, other: ArrayLike, level: float = 0.95) -> Estimate:
     """Returns the difference of two shares of successes, one - other, with Newcombe's interval from Wilson's.
 
     Unlike a bootstrap interval, it has a positive width even if all trials ended alike. It assumes that the two are
@@ -227,11 +304,12 @@ def share_difference(one: ArrayLike, other: ArrayLike) -> Estimate:
     Args:
         one: 1 for each success and 0 for each failure, of any shape.
         other: the same for the second share.
+        level: the interval's coverage.
 
     Raises:
         ValueError: one of them is empty.
     """
-    a, b = (wilson(int(np.sum(x)), np.size(x)) for x in (one, other))
+    a, b = (wilson(int(np.sum(x)), np.size(x), level) for x in (one, other))
     assert a.low is not None and a.high is not None and b.low is not None and b.high is not None
     below = np.hypot(a.value - a.low, b.high - b.value)
     above = np.hypot(a.high - a.value, b.value - b.low)

@@ -8,8 +8,10 @@ from rsjax.evaluation.statistics import (
     Estimate,
     bootstrap,
     holm,
+    nested_bootstrap,
     over_predicted_frames,
     paired_bootstrap,
+    paired_t,
     share_difference,
     verdict,
     welch,
@@ -159,3 +161,51 @@ def test_holms_p_rejects_what_holms_steps_reject(p: list[float]) -> None:
             i for i in rejected if not near[i]
         }
     assert (adjusted >= p).all() and (adjusted <= 1).all()
+
+
+def test_a_paired_t_test_agrees_with_scipy():
+    a, b = np.array([21.3, 21.9, 20.8, 21.1]), np.array([20.1, 21.2, 20.6, 20.4])
+    got, expected = paired_t(a, b), stats.ttest_rel(a, b)
+    interval = expected.confidence_interval()
+    np.testing.assert_allclose([got.t, got.p, got.df], [expected.statistic, expected.pvalue, expected.df])
+    np.testing.assert_allclose([got.difference.low, got.difference.high], [interval.low, interval.high])
+    assert paired_t(a[:1], b[:1]) is None
+
+
+def test_two_one_sided_tests_agree_with_scipy_and_err_as_often_as_they_say():
+    rng = np.random.default_rng(4)
+    a, b = rng.normal(0.05, 0.1, 5), rng.normal(0, 0.1, 6)
+    above = stats.ttest_ind(a, b - 0.2, equal_var=False, alternative="greater").pvalue  # of a - b > -0.2
+    below = stats.ttest_ind(a, b + 0.2, equal_var=False, alternative="less").pvalue
+    assert welch(a, b).p_beyond(0.2) == pytest.approx(max(above, below))
+    assert welch(a, b).p_of(0.1) == pytest.approx(stats.ttest_ind(a, b + 0.1, equal_var=False).pvalue)
+
+    def found_equal(difference, trials=400):
+        tests = [welch(rng.normal(difference, 0.05, 5), rng.normal(0, 0.05, 5)) for _ in range(trials)]
+        return float(np.mean([test.p_beyond(0.2) < 0.05 for test in tests]))
+
+    assert found_equal(0.0) > 0.95
+    assert found_equal(0.2) < 0.09, "at the margin, one in twenty"
+    assert found_equal(0.3) == 0
+    same = welch([1.0, 1.0], [1.0, 1.0])
+    assert (same.p_beyond(0.1), same.p_beyond(0.0), same.p_of(0.0), same.p_of(0.1)) == (0, 1, 1, 0)
+
+
+def test_a_nested_bootstrap_pairs_seeds_that_have_their_own_clips():
+    """Seeds differ by 5 and clips by 3, alike in both: neither widens the interval of their difference."""
+    rng = np.random.default_rng(5)
+    b = [rng.normal(rng.normal(0, 5), 3, clips) for clips in (30, 40, 25, 35)]
+    gains = np.array([0.4, 0.5, 0.6, 0.5])
+    got = nested_bootstrap([row + gain for row, gain in zip(b, gains, strict=True)], b)
+    assert got.value == pytest.approx(0.5)
+    assert 0.4 <= got.low < 0.5 < got.high <= 0.6
+    noisy = [row + 0.5 + rng.normal(0, 1, len(row)) for row in b]
+    drawn = []
+    for _ in range(2000):
+        rows = [rng.integers(len(row), size=len(row)) for row in b]
+        means = np.array([(one - other)[row].mean() for one, other, row in zip(noisy, b, rows, strict=True)])
+        drawn.append(rng.choice(means, 4).mean())
+    got = nested_bootstrap(noisy, b)
+    np.testing.assert_allclose([got.low, got.high], np.quantile(drawn, [0.025, 0.975]), atol=0.04)
+    with pytest.raises(ValueError):  # noqa: PT011
+        nested_bootstrap(b, b[:3])

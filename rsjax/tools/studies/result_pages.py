@@ -1,16 +1,22 @@
 """Pages whose tables are generated from files of results.
 
 A page has a table between two lines, ``<!-- table NAME PART -->`` and ``<!-- end -->``: that part of the file
-``NAME.json``. The file's ``kind`` says how it is read: :mod:`rsjax.tools.studies.transcribed`.
+``NAME.json``. The file's ``kind`` says how it is read: "measured" (:mod:`rsjax.tools.studies.paper.result_files`) or
+"transcribed" (:mod:`rsjax.tools.studies.transcribed`). A picture ``docs/results/NAME.png`` that a page shows is drawn
+from ``NAME.json`` if that was measured.
 """
 
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+
+from PIL import Image
 
 from rsjax.errors import UserError, did_you_mean
 from rsjax.files import read_json, write_file
+from rsjax.tools.studies.paper.claim_tables import claim_content, claim_figure, claim_tables
+from rsjax.tools.studies.paper.report import RESULTS
+from rsjax.tools.studies.paper.result_files import KIND, about_result, content_key, read_result
 from rsjax.tools.studies.tables import as_markdown
 from rsjax.tools.studies.transcribed import transcribed_table
 
@@ -35,11 +41,40 @@ def part_of(root: Path, name: str, part: str) -> str:
     names = [path.stem for path in (root / DATA).glob("*.json")]
     if name not in names:
         raise UserError(f"{DATA} has no {name}.json{did_you_mean(name, names)}")
-    content = read_json(root / DATA / f"{name}.json")
-    tables: dict[str, Any] = content["tables"]
+    path = root / DATA / f"{name}.json"
+    content = read_json(path)
+    if content["kind"] == KIND:
+        claim = claim_content(read_result(path))
+        tables = claim_tables(claim)
+        below = f"\n\n{claim['caption']} {about_result(path)}."
+    else:
+        tables = {key: transcribed_table(table) for key, table in content["tables"].items()}
+        below = ""
     if part not in tables:
         raise UserError(f"{DATA}/{name}.json has no part {part}{did_you_mean(part, tables)} ({', '.join(tables)})")
-    return as_markdown(transcribed_table(tables[part]), aligned=False)
+    return as_markdown(tables[part], aligned=False) + below
+
+
+def add_result(root: Path, study: Path, claim: str, name: str = "") -> Path:
+    """Copies what a study measured for a claim to the files of results, and returns the new file.
+
+    Args:
+        study: a directory of ``experiments.paper``.
+        name: the new file's name; empty: the claim's.
+
+    Raises:
+        UserError: the study has no finished training of the claim.
+    """
+    source = study / RESULTS / f"{claim}.json"
+    if not source.exists():
+        known = [path.stem for path in (study / RESULTS).glob("*.json")]
+        raise UserError(f"{source}: no such file{did_you_mean(claim, known)} (experiments.paper writes it)")
+    path = root / DATA / f"{name or claim}.json"
+    for suffix in (".json", ".npz"):
+        path.with_suffix(suffix).unlink(missing_ok=True)
+        if source.with_suffix(suffix).exists():
+            write_file(path.with_suffix(suffix), source.with_suffix(suffix).read_bytes())
+    return path
 
 
 def generated(root: Path, page: Path) -> str:
@@ -58,19 +93,41 @@ def _table(root: Path, page: Path, found: re.Match[str]) -> str:
         raise UserError(f"{page.relative_to(root)}: {error}") from error
 
 
+def figures(root: Path) -> Iterator[tuple[Path, Path]]:
+    """Yields each picture that a page shows and that is drawn from a file of results, with this file."""
+    for page in pages(root):
+        for link in re.findall(r"\]\(([\w./-]+)\.png\)", page.read_text()):
+            picture = (page.parent / f"{link}.png").resolve()
+            data = root / DATA / f"{picture.stem}.json"
+            if picture.parent == (root / FOLDER).resolve() and data.exists() and read_json(data)["kind"] == KIND:
+                yield picture, data
+
+
+def _is_of(picture: Path, data: Path) -> bool:
+    """Returns whether a picture was drawn from a file of results as it is now."""
+    if not picture.exists():
+        return False
+    with Image.open(picture) as image:
+        return image.info.get("Source") == content_key(data)
+
+
 def write_pages(root: Path) -> list[Path]:
-    """Makes the tables of all pages anew, and returns the pages that have changed."""
+    """Makes the tables of all pages and their figures anew, and returns the files that have changed."""
     changed = []
     for page in pages(root):
         text = generated(root, page)
         if text != page.read_text():
             write_file(page, text.encode())
             changed.append(page)
+    for picture, data in figures(root):
+        if not _is_of(picture, data):
+            write_file(picture, claim_figure(read_result(data), content_key(data)) or b"")
+            changed.append(picture)
     return changed
 
 
 def differences(root: Path) -> Iterator[str]:
-    """Yields a line for each table that differs from its file, and for each table of a result that has none."""
+    """Yields a line for each table or figure that differs from its file, and for each table of a result without one."""
     for page in pages(root):
         where = page.relative_to(root)
         text = page.read_text()
@@ -78,6 +135,8 @@ def differences(root: Path) -> Iterator[str]:
             if found["table"] != _table(root, page, found):
                 yield f"{where}: table {found['name']} {found['part']} differs from {DATA}/{found['name']}.json"
         if page.parent == root / FOLDER:
-            for line in re.findall(r"^\|.*$", GENERATED.sub("", text), re.M):
+            for line in re.findall(r"^\|.*$", GENERATED.sub("", text), re.MULTILINE)[:1]:
                 yield f"{where}: a table outside the marks of a generated one: {line[:60]}"
-                break
+    for picture, data in figures(root):
+        if not _is_of(picture, data):
+            yield f"{FOLDER}/{picture.name}: the figure was not drawn from {DATA}/{data.name} as it is"

@@ -2,14 +2,16 @@
 
 import io
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Protocol
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from rsjax.evaluation.registry import Metric
-from rsjax.tools.studies.ablation.table import Row, best
+from rsjax.tools.studies.ablation.table import best
+from rsjax.tools.studies.results import Spread
 from rsjax.tools.studies.tables import ABSENT
 
 PLAIN = "#3b7dd8"
@@ -21,8 +23,27 @@ MAX_LINES = 150  # viewers refuse taller pictures
 LEGEND = "circles: seeds; bar: mean ± sample standard deviation; orange: best mean, which may be chance"
 
 
-def draw(rows: Sequence[Row], columns: Sequence[Metric], title: str) -> bytes:
-    """Returns the picture as PNG: circles are seeds, bars are mean ± sample deviation, and the best mean is orange."""
+class Line(Protocol):
+    """A line of the picture: a row of a grid, or an arm of a claim."""
+
+    @property
+    def label(self) -> str:
+        """Its name."""
+
+    @property
+    def spreads(self) -> Mapping[str, Spread]:
+        """Mean and deviation over seeds, by metric."""
+
+    def by_seed(self, name: str) -> Sequence[float]:
+        """Returns the seeds' scores."""
+
+
+def draw(rows: Sequence[Line], columns: Sequence[Metric], title: str, source: str = "") -> bytes:
+    """Returns the picture as PNG: circles are seeds, bars are mean ± sample deviation, and the best mean is orange.
+
+    Args:
+        source: what the picture is made of, for its metadata.
+    """
     shown = rows[:MAX_LINES]
     left = 0.075 * max(len(row.label) for row in shown)
     size = (left + PANEL * max(1, len(columns)), 1.5 + LINE * len(shown))
@@ -38,18 +59,18 @@ def draw(rows: Sequence[Row], columns: Sequence[Metric], title: str) -> bytes:
     else:
         figure.text(0.5, 0.5, "no cell is finished yet", ha="center", color=FAINT)
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=110)
+    figure.savefig(buffer, format="png", dpi=110, metadata={"Source": source} if source else None)
     return buffer.getvalue()
 
 
-def _panel(axes: Axes, column: Metric, rows: Sequence[Row], top: set[int]) -> None:
+def _panel(axes: Axes, column: Metric, rows: Sequence[Line], top: set[int]) -> None:
     for y, row in enumerate(rows):
         if column.name not in row.spreads:
             axes.text(0.5, y, ABSENT, transform=axes.get_yaxis_transform(), ha="center", va="center", color=FAINT)
             continue
         mean, std, _ = row.spreads[column.name]
         color = BEST if y in top else PLAIN
-        seeds = [result.metrics[column.name] for result in row.results if column.name in result.metrics]
+        seeds = row.by_seed(column.name)
         axes.scatter(seeds, [y + 0.25] * len(seeds), s=16, facecolors="none", edgecolors=color, linewidths=0.9)
         axes.errorbar(mean, y, xerr=std, fmt="D", markersize=5, color=color, capsize=3, linewidth=1.4)
     axes.set_title(textwrap.fill(column.heading, 26), fontsize=10, loc="left")

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 from rsjax.evaluation.registry import Metric, metrics
 from rsjax.tools.studies import tables
@@ -36,10 +36,22 @@ class Row:
         """The row's values, such as ``model.depth head, model.loss.keypoints none``."""
         return ", ".join(f"{name} {value}".strip() for name, value in self.values.items()) or "as configured"
 
+    def by_seed(self, name: str) -> list[float]:
+        """Returns the results' scores by a metric, without those of results that lack it."""
+        return [result.metrics[name] for result in self.results if name in result.metrics]
+
     @property
     def reasons(self) -> dict[str, str]:
         """Why a result of the row has no number for a metric, by name."""
         return {name: reason for result in self.results for name, reason in result.reasons.items()}
+
+
+class Scored(Protocol):
+    """A row with means over seeds."""
+
+    @property
+    def spreads(self) -> Mapping[str, Spread]:
+        """Mean and deviation over seeds, by metric."""
 
 
 def tabulate(results: Iterable[RunResult], fields: Sequence[str]) -> list[Row]:
@@ -55,7 +67,7 @@ def tabulate(results: Iterable[RunResult], fields: Sequence[str]) -> list[Row]:
     return rows
 
 
-def best(rows: Sequence[Row], column: Metric) -> set[int]:
+def best(rows: Sequence[Scored], column: Metric) -> set[int]:
     """Returns the rows whose mean, rounded as shown, is the best; an empty set if fewer than two rows have a mean."""
     spreads = {i: row.spreads[column.name] for i, row in enumerate(rows) if column.name in row.spreads}
     means = {i: round(s.mean, column.decimals) for i, s in spreads.items() if not math.isnan(s.mean)}

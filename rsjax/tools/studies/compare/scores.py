@@ -15,7 +15,7 @@ from jaxtyping import Float
 from rsjax.config import require
 from rsjax.errors import did_you_mean
 from rsjax.evaluation.registry import Metric, metrics
-from rsjax.evaluation.statistics import Estimate, Verdict, Welch, paired_bootstrap, verdict, welch
+from rsjax.evaluation.statistics import Estimate, TTest, Verdict, paired_bootstrap, verdict, welch
 from rsjax.tools.studies.compare.groups import Group
 from rsjax.tools.studies.results import Spread, spread
 
@@ -84,7 +84,7 @@ class Difference:
     """
 
     interval: Estimate | None
-    welch: Welch | None
+    welch: TTest | None
     finding: Finding
 
 
@@ -179,7 +179,7 @@ def difference(entry: Entry, reference: Entry, metric: Metric) -> Difference | N
     return Difference(interval, test, _finding(interval, test, metric))
 
 
-def _finding(interval: Estimate | None, test: Welch | None, metric: Metric) -> Finding:
+def _finding(interval: Estimate | None, test: TTest | None, metric: Metric) -> Finding:
     intervals = [each for each in (interval, test.difference if test else None) if each is not None]
     if intervals and all(each.value == each.low == each.high == 0 for each in intervals):
         return "same"

@@ -8,6 +8,23 @@ from typing import Any, Literal
 from rsjax.config import require
 from rsjax.errors import did_you_mean
 
+# The margins within which two scores count as equal, by metric, in its unit; chosen before they were used.
+EQUAL = {
+    "psnr": 0.1,
+    "psnr_motion": 0.1,
+    "delta_psnr": 0.1,
+    "delta_psnr_uniform": 0.1,
+    "ssim": 0.005,
+    "lpips_alex": 0.005,
+    "depth_absrel": 0.002,
+    "cube_error_widths": 0.05,
+    "gripper_error_widths": 0.05,
+    "physics_iq_spatial": 0.01,
+    "physics_iq_spatiotemporal": 0.01,
+    "physics_iq_weighted": 0.01,
+    "physics_iq_mse": 0.0005,
+}
+
 
 @dataclass(frozen=True)
 class Arm:
@@ -53,6 +70,8 @@ class Comparison:
         measurement: the source of the scores: empty for the run's evaluation, otherwise the name of a
             :func:`rsjax.tools.studies.paper.measurements.measurement`.
         margin: by how much the first arm is better, in the metric's unit; negative: it is worse by at most ``-margin``.
+        equal: the margin within which both count as equal, in the metric's unit; None: that of :data:`EQUAL`, if the
+            metric has one; 0: equality is not tested.
     """
 
     metric: str
@@ -62,6 +81,12 @@ class Comparison:
     than_score: str = ""
     measurement: str = ""
     margin: float = 0.0
+    equal: float | None = None
+
+    @property
+    def equal_margin(self) -> float:
+        """The margin within which both count as equal; 0 if equality is not tested."""
+        return EQUAL.get(self.metric, 0.0) if self.equal is None else self.equal
 
 
 @dataclass(frozen=True)
@@ -97,6 +122,11 @@ class Claim:
         for comparison in self.comparisons:
             for name in (comparison.better, comparison.than):
                 require(name in names, f"claim {self.name!r} compares {name!r}, which is none of its arms")
+
+    @property
+    def equal(self) -> Literal["steps", "seconds", "flops"]:
+        """What the trainings of its arms have in common: steps, unless an arm has equal seconds or operations."""
+        return next((arm.equal for arm in self.arms if arm.equal != "steps"), "steps")
 
     def arm(self, name: str) -> Arm:
         """Returns the arm of this name."""

@@ -1,8 +1,9 @@
-"""Judges claims by the per-clip scores of their cells."""
+"""Judges claims by the scores of their arms, whether they are read from run directories or from a committed file."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -10,22 +11,31 @@ from jaxtyping import Float
 from rsjax.evaluation.registry import Metric, Unavailable, metrics
 from rsjax.evaluation.statistics import (
     Estimate,
+    Statistic,
+    TTest,
     Verdict,
-    Welch,
     can_lose,
+    holm,
+    nested_bootstrap,
     paired_bootstrap,
+    paired_t,
     share_difference,
     verdict,
     welch,
 )
 from rsjax.tools.pipeline.run import Run
+from rsjax.tools.studies.paper.arm_scores import ArmScores, read_arm
 from rsjax.tools.studies.paper.claim import Claim, Comparison
 from rsjax.tools.studies.paper.measurements import read_scores
-from rsjax.tools.studies.paper.plan import Cell, Plan
-from rsjax.tools.studies.results import RunResult, Spread, read_run, spread
+from rsjax.tools.studies.paper.plan import Plan
+from rsjax.tools.studies.results import read_run
 
-CEILING = "psnr_tokenizer"  # PSNR of the reconstruction by each family's own autoencoder, a limit on the prediction's
 SUCCESS = "success"  # the name of scores that are 1 or 0 for each trial; all trials may end alike
+SIGNIFICANT = 0.05  # an adjusted p-value below it decides, if the interval agrees
+LEVEL = 0.95  # of the intervals
+EQUAL_LEVEL = 0.9  # of the interval that must lie within the margin of equality: two one-sided tests at 0.05
+
+Rows = Sequence[Float[np.ndarray, " _"]]  # for each seed, one number per clip
 
 
 @dataclass(frozen=True)
@@ -38,11 +48,17 @@ class Judged:
         seeds: the numbers of finished seeds of both arms.
         published: the paper's difference, if it has one.
         sides: both scores, means over seeds.
-        difference: the arm claimed to be better minus the other, with an interval over seeds and clips.
-        test: Welch's t-test over the seeds; None with fewer than two seeds.
-        clips: the number of clips that have a score in all seeds of both arms.
-        verdict: by the interval that contains both the difference's and the test's.
-        reason: why there is no difference, or why its interval gives no verdict.
+        difference: the arm claimed to be better minus the other, with the interval that decides: it contains the one
+            from resampling and that of the t-test.
+        resampled: the same with the interval from resampling seeds and clips.
+        inner: the same with the 90 % interval that decides whether both are equal.
+        test: the t-test over the seeds, Welch's or, if each seed has its own clips, a paired one; None with fewer than
+            two seeds.
+        clips: the number of clips that have a score in all seeds of both arms; of a seed with clips of its own.
+        p: the p-value of the claimed margin, by Holm adjusted for the claim's comparisons.
+        equal_p: the p-value of a difference beyond the margin of equality, likewise adjusted.
+        verdict: "holds" and "does not hold" need the interval and p; "equal" needs the inner interval and equal_p.
+        reason: why there is no difference, or why there is no verdict.
     """
 
     comparison: Comparison
@@ -51,34 +67,32 @@ class Judged:
     published: float | None = None
     sides: tuple[float, float] | None = None
     difference: Estimate | None = None
-    test: Welch | None = None
+    resampled: Estimate | None = None
+    inner: Estimate | None = None
+    test: TTest | None = None
     clips: int = 0
+    p: float | None = None
+    equal_p: float | None = None
     verdict: Verdict = "cannot tell"
     reason: str = ""
 
+    @property
+    def shift(self) -> float:
+        """The difference at the border of the claim: its margin, towards better values."""
+        return self.comparison.margin if self.metric.better == "higher" else -self.comparison.margin
 
-@dataclass(frozen=True)
-class Trained:
-    """An arm's cells and their results.
+
+class Pair(NamedTuple):
+    """The scores of two arms for the clips that both have.
 
     Attributes:
-        name: the arm's name.
-        cells: one for each seed, including those that the budget leaves out.
-        results: the results of the same cells.
-        absent: why the arm cannot be trained; empty if it can.
-        spreads: mean and deviation over finished seeds of the claim's scores, by metric or name in ``Claim.beside``.
+        a, b: of the arm claimed to be better and of the other, by seed.
+        own_clips: whether each seed has clips of its own, so that seeds are paired.
     """
 
-    name: str
-    cells: tuple[Cell, ...]
-    results: tuple[RunResult, ...]
-    absent: str
-    spreads: Mapping[str, Spread]
-
-    @property
-    def finished(self) -> tuple[RunResult, ...]:
-        """The results of finished seeds."""
-        return tuple(result for result in self.results if result.state == "finished")
+    a: Rows
+    b: Rows
+    own_clips: bool
 
 
 @dataclass(frozen=True)
@@ -86,13 +100,13 @@ class Outcome:
     """A claim with all that was measured for it."""
 
     claim: Claim
-    arms: tuple[Trained, ...]
+    arms: tuple[ArmScores, ...]
     judged: tuple[Judged, ...]
 
     @property
     def counts(self) -> dict[Verdict, int]:
         """The number of comparisons with each verdict, among those that could be made."""
-        counts: dict[Verdict, int] = {"holds": 0, "does not hold": 0, "cannot tell": 0}
+        counts: dict[Verdict, int] = {"holds": 0, "does not hold": 0, "equal": 0, "cannot tell": 0}
         for each in self.judged:
             if each.difference is not None:
                 counts[each.verdict] += 1
@@ -102,12 +116,17 @@ class Outcome:
     def verdict(self) -> Verdict:
         """The verdict on the whole claim, from the comparisons that could be made.
 
-        "holds" if all of them hold, "does not hold" if any does not hold; otherwise "cannot tell".
+        "holds" if all of them hold, "equal" if all are equal. "does not hold" if any does not hold, or if some are
+        equal and nothing is open: where arms are equal, neither is better. Otherwise "cannot tell".
         """
         counts = self.counts
-        if counts["does not hold"]:
+        made = sum(counts.values())
+        for word in ("holds", "equal"):
+            if made and counts[word] == made:
+                return word
+        if counts["does not hold"] or (counts["equal"] and not counts["cannot tell"]):
             return "does not hold"
-        return "holds" if counts["holds"] and not counts["cannot tell"] else "cannot tell"
+        return "cannot tell"
 
 
 def judge_all(plan: Plan, runs: Mapping[str, Run]) -> list[Outcome]:
@@ -117,94 +136,145 @@ def judge_all(plan: Plan, runs: Mapping[str, Run]) -> list[Outcome]:
         runs: the run of each cell of the plan, by name.
     """
     results = {name: read_run(runs[name]) for name in plan.cells}
-    read: dict[tuple[str, str], tuple[Mapping[str, Sequence[float]], str]] = {}
-    sources = {"", *(name for claim in plan.claims for arm in claim.arms for name in claim.measurements(arm.name))}
-    for name, result in results.items():
-        for source in sources:
-            if result.state == "finished":
-                read[name, source] = read_scores(runs[name], source)
-    return [_judge_claim(claim, plan, results, read) for claim in plan.claims]
+    read = cache(read_scores)  # claims share trainings
+    return [
+        judge_claim(claim, [read_arm(claim, arm.name, plan, results, read) for arm in claim.arms])
+        for claim in plan.claims
+    ]
 
 
-def _judge_claim(claim: Claim, plan: Plan, results: Mapping[str, RunResult], read: Mapping[Any, Any]) -> Outcome:
-    arms = {}
-    for arm in claim.arms:
-        cells = plan.of(claim.name, arm.name)
-        found = tuple(results[cell.name] for cell in cells)
-        finished = [result.metrics for result in found if result.state == "finished"]
-        names = dict.fromkeys([*(each.metric for each in claim.comparisons), CEILING])
-        values = {name: [scores[name] for scores in finished if name in scores] for name in names}
-        for name, source in claim.beside.items():
-            measured = [read[result.name, source][0] for result in found if result.state == "finished"]
-            values[name] = [float(np.mean(scores[name])) for scores in measured if name in scores]
-        spreads = {name: spread(numbers) for name, numbers in values.items() if numbers}
-        arms[arm.name] = Trained(arm.name, cells, found, plan.absent.get((claim.name, arm.name), ""), spreads)
-    judged = tuple(_judge(claim, each, arms, read) for each in claim.comparisons)
-    return Outcome(claim, tuple(arms.values()), judged)
+def judge_claim(claim: Claim, arms: Sequence[ArmScores]) -> Outcome:
+    """Judges a claim by its arms' scores."""
+    known = {arm.name: arm for arm in arms}
+    measured = [_measure(claim, comparison, known) for comparison in claim.comparisons]
+    return Outcome(claim, tuple(arms), tuple(_decide(measured)))
 
 
-def _judge(claim: Claim, comparison: Comparison, arms: Mapping[str, Trained], read: Mapping[Any, Any]) -> Judged:
+def _measure(claim: Claim, comparison: Comparison, arms: Mapping[str, ArmScores]) -> Judged:
+    """Returns a comparison with its difference, intervals and test, without a verdict."""
     metric = metrics().get(comparison.metric) or Metric(comparison.metric, comparison.metric, "", "higher", 3)
     better = arms[comparison.better]
     than = arms[comparison.than]
-    judged = Judged(comparison, metric, (len(better.finished), len(than.finished)), _published(claim, comparison))
+    judged = Judged(comparison, metric, (len(better.seeds), len(than.seeds)), _published(claim, comparison))
     try:
-        a, b = _paired(better, than, comparison, read)
+        pair = _paired(better, than, comparison)
     except Unavailable as reason:
         return replace(judged, reason=str(reason))
     summarise = np.mean if metric.statistic == "mean" else np.median
-    one, other = (summarise(scores, axis=1) for scores in (a, b))
+    one, other = (np.array([summarise(row) for row in rows]) for rows in (pair.a, pair.b))
     success = comparison.metric == SUCCESS
-    difference = share_difference(a, b) if success else paired_bootstrap(a, b, statistic=metric.statistic)
-    judged = replace(judged, sides=(one.mean(), other.mean()), difference=difference, clips=a.shape[1])
-    test = welch(one, other)
-    if test is None:
+    resampled, inner = (_resampled(pair, level, metric.statistic, success) for level in (LEVEL, EQUAL_LEVEL))
+    judged = replace(
+        judged,
+        sides=(float(one.mean()), float(other.mean())),
+        difference=resampled,
+        resampled=resampled,
+        clips=min(map(len, pair.a)),
+    )
+    compare = paired_t if pair.own_clips else welch
+    test = compare(one, other, LEVEL)
+    inner_test = compare(one, other, EQUAL_LEVEL)
+    if test is None or inner_test is None:
         return replace(judged, reason="one seed says nothing about others")
-    judged = replace(judged, test=test)
-    if success and not can_lose(b, -comparison.margin):
+    judged = replace(judged, test=test, difference=_wider(resampled, test), inner=_wider(inner, inner_test))
+    if success and not can_lose(np.stack(pair.b), -comparison.margin):
         return replace(judged, reason="the other side succeeds too seldom for a loss of the margin to show")
-    return replace(judged, verdict=verdict(_wider(difference, test), metric.better, comparison.margin))
+    return judged
 
 
-def _paired(
-    better: Trained, than: Trained, comparison: Comparison, read: Mapping[Any, Any]
-) -> tuple[Float[np.ndarray, "S B"], Float[np.ndarray, "Z B"]]:
+def _decide(measured: Sequence[Judged]) -> list[Judged]:
+    """Returns the comparisons of a claim with their verdicts; Holm's method adjusts the p-values of all of them."""
+    tested = [each for each in measured if each.test is not None and not each.reason]
+    margins = [each for each in tested if each.comparison.equal_margin]
+    p = dict(zip(map(id, tested), holm([each.test.p_of(each.shift) for each in tested]), strict=True))  # type: ignore[union-attr]
+    beyond = holm([each.test.p_beyond(each.comparison.equal_margin) for each in margins])  # type: ignore[union-attr]
+    equal_p = dict(zip(map(id, margins), beyond, strict=True))
+    judged = []
+    for each in measured:
+        if id(each) in p:
+            adjusted = float(p[id(each)])
+            beside = float(equal_p[id(each)]) if id(each) in equal_p else None
+            each = replace(each, p=adjusted, equal_p=beside)
+            each = replace(each, verdict=_verdict(each))
+        judged.append(each)
+    return judged
+
+
+def _verdict(judged: Judged) -> Verdict:
+    found = verdict(judged.difference, judged.metric.better, judged.comparison.margin)
+    if found != "cannot tell" and judged.p is not None and judged.p < SIGNIFICANT:
+        return found
+    inner = judged.inner
+    margin = judged.comparison.equal_margin
+    within = inner is not None and inner.low is not None and inner.high is not None
+    if within and judged.equal_p is not None and judged.equal_p < SIGNIFICANT:
+        assert inner is not None and inner.low is not None and inner.high is not None
+        if -margin < inner.low and inner.high < margin:
+            return "equal"
+    return "cannot tell"
+
+
+def _resampled(pair: Pair, level: float, statistic: Statistic, success: bool) -> Estimate:
+    """Returns the difference with its interval over seeds and clips, or, for success rates, Newcombe's."""
+    if success:
+        return share_difference(np.concatenate(pair.a), np.concatenate(pair.b), level)
+    if pair.own_clips:
+        return nested_bootstrap(pair.a, pair.b, level=level, statistic=statistic)
+    return paired_bootstrap(np.stack(pair.a), np.stack(pair.b), level=level, statistic=statistic)
+
+
+def _paired(better: ArmScores, than: ArmScores, comparison: Comparison) -> Pair:
     """Returns both arms' scores by seed, for the clips that have a finite score in all seeds of both.
+
+    If each seed has clips of its own, a clip needs a score in its seed of both, and seeds of one arm alone are left
+    out.
 
     Raises:
         Unavailable: there is nothing to compare.
     """
-    a = _scores(better, comparison.score or comparison.metric, comparison, read)
-    b = _scores(than, comparison.than_score or comparison.metric, comparison, read)
-    if better is not than and better.cells == than.cells:
+    a = _scores(better, comparison.score or comparison.metric, comparison)
+    b = _scores(than, comparison.than_score or comparison.metric, comparison)
+    if better is not than and better.trainings == than.trainings:
         raise Unavailable("both arms are the same configuration in this preset")
-    if a.shape[1] != b.shape[1]:
-        raise Unavailable(f"scores of {a.shape[1]} and {b.shape[1]} clips cannot be paired")
-    kept = np.isfinite(a).all(0) & np.isfinite(b).all(0)
-    if not kept.any():
+    own_clips = len(set(better.clips)) > 1 or len(set(than.clips)) > 1
+    if own_clips:
+        common = [clips for clips in better.clips if clips in than.clips]
+        a = [a[better.clips.index(clips)] for clips in common]
+        b = [b[than.clips.index(clips)] for clips in common]
+        sizes = [(len(one), len(other)) for one, other in zip(a, b, strict=True)]
+        different = next((pair for pair in sizes if pair[0] != pair[1]), None)
+    else:
+        for arm, rows in ((better, a), (than, b)):
+            if len({len(row) for row in rows}) > 1:
+                raise Unavailable(f"{arm.name}: its seeds were scored on different numbers of clips")
+        different = None if len(a[0]) == len(b[0]) else (len(a[0]), len(b[0]))
+    if different:
+        raise Unavailable(f"scores of {different[0]} and {different[1]} clips cannot be paired")
+    if own_clips:
+        kept = [np.isfinite(one) & np.isfinite(other) for one, other in zip(a, b, strict=True)]
+    else:
+        kept = [np.isfinite(np.stack([*a, *b])).all(0)] * max(len(a), len(b))
+    if not kept or not all(each.any() for each in kept):
         raise Unavailable("no clip has a score in all seeds of both")
-    return a[:, kept], b[:, kept]
+    return Pair(
+        [row[keep] for row, keep in zip(a, kept, strict=False)],
+        [row[keep] for row, keep in zip(b, kept, strict=False)],
+        own_clips,
+    )
 
 
-def _scores(arm: Trained, score: str, comparison: Comparison, read: Mapping[Any, Any]) -> Float[np.ndarray, "S B"]:
+def _scores(arm: ArmScores, score: str, comparison: Comparison) -> Rows:
     """Returns an arm's scores by seed.
 
     Raises:
-        Unavailable: no seed has finished, a finished seed lacks this score, or seeds have different numbers of clips.
+        Unavailable: no seed has finished, or a finished seed lacks this score.
     """
-    if arm.absent or not arm.finished:
+    if arm.absent or not arm.seeds:
         raise Unavailable(f"{arm.name}: {arm.absent or 'no seed has finished'}")
-    rows = []
-    for cell, result in zip(arm.cells, arm.results, strict=True):
-        if result.state == "finished":
-            scores, reason = read[cell.name, comparison.measurement]
-            if score not in scores:
-                reason = reason or result.reasons.get(comparison.metric) or f"no score named {score}"
-                raise Unavailable(f"{arm.name}: {reason}")
-            rows.append(np.asarray(scores[score], float))
-    if len({len(row) for row in rows}) > 1:
-        raise Unavailable(f"{arm.name}: its seeds were scored on different numbers of clips")
-    return np.stack(rows)
+    scored = arm.scores[comparison.measurement][score]
+    if scored.reason:
+        raise Unavailable(f"{arm.name}: {scored.reason}")
+    return [np.asarray(row, float) for row in scored.rows]
 
 
 def _published(claim: Claim, comparison: Comparison) -> float | None:
@@ -214,10 +284,10 @@ def _published(claim: Claim, comparison: Comparison) -> float | None:
     return better[score] - than[other] if score in better and other in than else None
 
 
-def _wider(interval: Estimate, test: Welch) -> Estimate:
+def _wider(interval: Estimate, test: TTest) -> Estimate:
     """Returns the smallest interval that contains both, because few seeds make the bootstrap's too narrow.
 
-    For a single score per seed, such as a correlation, there is no bootstrap interval, and Welch's is returned.
+    For a single score per seed, such as a correlation, there is no bootstrap interval, and the test's is returned.
     """
     low = test.difference.low
     high = test.difference.high

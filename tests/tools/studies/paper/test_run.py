@@ -24,7 +24,7 @@ from rsjax.tools.pipeline import stages
 from rsjax.tools.pipeline.run import Run
 from rsjax.tools.studies.ablation import sweep
 from rsjax.tools.studies.ablation.figure import draw
-from rsjax.tools.studies.paper import measurements
+from rsjax.tools.studies.paper import claim_tables, measurements
 from rsjax.tools.studies.paper import report as page
 from rsjax.tools.studies.paper.budget import HOUR, Scale
 from rsjax.tools.studies.paper.claim import Comparison
@@ -55,7 +55,7 @@ def report(place: Path) -> dict[str, Any]:
     return content
 
 
-@pytest.mark.parametrize(("gain", "verdict"), [(0.5, "holds"), (-0.5, "does not hold"), (0.0, "cannot tell")])
+@pytest.mark.parametrize(("gain", "verdict"), [(0.5, "holds"), (-0.5, "does not hold"), (0.0, "equal")])
 def test_a_claim_is_judged_by_paired_differences_over_seeds_and_clips(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, gain: float, verdict: Verdict
 ) -> None:
@@ -63,14 +63,15 @@ def test_a_claim_is_judged_by_paired_differences_over_seeds_and_clips(
     toy.stub_stages(monkeypatch, tmp_path, gain)
     (claim,) = run(toy.plan(toy.claim()), tmp_path)["claims"]
     (compared,) = claim["comparisons"]
-    assert claim["verdict"] == compared["verdict"] == verdict
+    assert claim["verdict"] == verdict
+    assert compared["verdict"] == ("equal within 0.1 dB" if verdict == "equal" else verdict)
     assert (compared["seeds"], compared["clips"]) == ([3, 3], toy.CLIPS)
     numbers = compared["values"]
     assert numbers["low"] < gain < numbers["high"] and numbers["difference"] == pytest.approx(gain, abs=0.05)
     assert numbers["published"] == 0.5
     with_, without = claim["arms"]
     means = [arm["values"]["psnr"]["mean"] for arm in (with_, without)]
-    assert means[0] - means[1] == pytest.approx(numbers["difference"])
+    assert means[0] - means[1] == pytest.approx(numbers["difference"], abs=0.005)  # clips have four digits
 
 
 def test_cells_of_several_claims_run_once_and_a_second_command_runs_none(tmp_path: Path) -> None:
@@ -164,7 +165,8 @@ def test_a_single_score_per_seed_is_judged_by_welchs_interval(tmp_path: Path) ->
     measurements._MEASUREMENTS.pop("correlation")
     one, other = claim["comparisons"]
     assert (one["verdict"], one["sides"], one["clips"]) == ("holds", "0.980 / 0.900", 1)
-    assert one["values"]["sides"] == pytest.approx([0.98, 0.9]) and one["values"]["low"] is None
+    assert one["values"]["sides"] == pytest.approx([0.98, 0.9])
+    assert one["values"]["resampled_low"] is None and one["values"]["low"] > 0
     assert (other["verdict"], other["reason"]) == ("not measured", "no clip has a score in all seeds of both")
 
 
@@ -236,7 +238,7 @@ def test_a_run_of_the_preset_is_a_cell_and_its_scores_are_in_the_report(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(page, "draw", draw)
+    monkeypatch.setattr(claim_tables, "draw", draw)
     options = ("--preset", "debug", "--budget", "3h", "--dir", tmp_path, "--data-dir", command.data)
     main(*options, "--only", "table2", "--dry-run")
     lines = capsys.readouterr().out.splitlines()
@@ -251,7 +253,7 @@ def test_a_run_of_the_preset_is_a_cell_and_its_scores_are_in_the_report(
     for claim, arm in (("table2", "full"), ("data-scaling", "all")):
         (found,) = (each for each in claims[claim]["arms"] if each["name"] == arm)
         assert found["seeds"] == "1 of 3"
-        assert found["values"]["psnr"]["mean"] == metrics["psnr"]
+        assert found["values"]["psnr"]["mean"] == pytest.approx(metrics["psnr"], rel=1e-5)
     assert {claim["verdict"] for claim in claims.values()} == {"cannot tell"}
     assert (tmp_path / "report.html").exists() and (tmp_path / "figures" / "table2.png").exists()
 
@@ -338,11 +340,11 @@ def test_a_figure_has_the_scores_that_the_claim_compares(tmp_path: Path, monkeyp
     """Tables of grids leave some of them out, such as Physics-IQ's; what was not measured has no panel."""
     drawn: list[str] = []
 
-    def draw(rows: Any, columns: Any, title: str) -> bytes:
+    def draw(rows: Any, columns: Any, title: str, source: str) -> bytes:
         drawn.extend(column.name for column in columns)
         return b""
 
-    monkeypatch.setattr(page, "draw", draw)
+    monkeypatch.setattr(claim_tables, "draw", draw)
     compared = (Comparison(metric, "with", "without") for metric in ("psnr", "physics_iq_spatial", "ssim"))
     run(toy.plan(toy.claim("toy", *compared)), tmp_path)
     assert set(drawn) == {"psnr", "physics_iq_spatial"}

@@ -11,7 +11,7 @@ from rsjax.config import Config, RoboScapeConfig, presets
 from rsjax.evaluation.results import Evaluation, save_evaluation
 from rsjax.tools.pipeline import stages
 from rsjax.tools.pipeline.run import Run
-from rsjax.tools.studies.paper import budget, report
+from rsjax.tools.studies.paper import budget, claim_tables
 from rsjax.tools.studies.paper.claim import Arm, Claim, Comparison, pairs
 from rsjax.tools.studies.paper.plan import Plan, make_plan
 from tests.tools.studies.ablation import toy
@@ -63,4 +63,4 @@ def stub_stages(monkeypatch: pytest.MonkeyPatch, record: Path, gain: float = 0.5
         (run.directory / "metrics.json").write_text(json.dumps(result.metrics | {"reasons": result.reasons}))
 
     monkeypatch.setattr(stages, "run_all", scored)
-    monkeypatch.setattr(report, "draw", lambda rows, columns, title: b"")
+    monkeypatch.setattr(claim_tables, "draw", lambda rows, columns, title, source: b"")

@@ -1,0 +1,171 @@
+"""What was measured of a claim's arms: all that the judge needs, from run directories or from a committed file."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from rsjax.config import Config
+from rsjax.tools.pipeline.run import Run
+from rsjax.tools.studies.paper import budget
+from rsjax.tools.studies.paper.claim import Claim
+from rsjax.tools.studies.paper.measurements import Scores
+from rsjax.tools.studies.paper.plan import Plan
+from rsjax.tools.studies.results import RunResult, Spread, spread
+
+ReadScores = Callable[[Run, str], tuple[Scores, str]]
+
+CEILING = "psnr_tokenizer"  # PSNR of the reconstruction by each family's own autoencoder, a limit on the prediction's
+BASELINES = ("_repeat_first", "_tokenizer")  # suffixes of the scores of what a model is compared with
+CLIP_DIGITS = 4  # significant digits of a clip's score, here as in the committed files
+SEED_DIGITS = 6  # of a seed's
+
+
+@dataclass(frozen=True)
+class Scored:
+    """An arm's scores by one name.
+
+    Attributes:
+        rows: for each finished seed, one number per clip, NaN where a clip has no score; none if a seed lacks them.
+        reason: why there are none.
+    """
+
+    rows: tuple[tuple[float, ...], ...] = ()
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class ArmScores:
+    """What was measured of an arm.
+
+    Attributes:
+        name: the arm's name.
+        planned: the number of trainings that it was meant to have.
+        seeds: those of finished trainings.
+        trainings: the names of the finished trainings' directories, which end with a content key.
+        clips: the content key of each finished training's clips; they differ if the seed decides the clips too.
+        numbers: by metric or name in ``Claim.beside``, the score of each finished seed over all clips; None without.
+        scores: by measurement ("" for the run's own evaluation) and by name, the clips' scores.
+        parameters: trained and frozen ones, in words.
+        steps: of the world model; None with a curriculum, whose epochs decide them.
+        tflop, minutes: of the training, autoencoder included.
+        absent: why the arm cannot be trained; empty if it can.
+        results: of all its trainings, finished or not; empty if the scores are from a file.
+    """
+
+    name: str
+    planned: int
+    seeds: tuple[int, ...]
+    trainings: tuple[str, ...]
+    clips: tuple[str, ...]
+    numbers: Mapping[str, Sequence[float | None]]
+    scores: Mapping[str, Mapping[str, Scored]]
+    parameters: str | None = None
+    steps: int | None = None
+    tflop: float | None = None
+    minutes: float | None = None
+    absent: str = ""
+    results: tuple[RunResult, ...] = field(default=(), compare=False)
+
+    @property
+    def label(self) -> str:
+        """The name of its line in a figure."""
+        return self.name
+
+    @property
+    def spreads(self) -> dict[str, Spread]:
+        """Mean and deviation over the seeds of every score that any of them has, by name."""
+        return {name: spread(values) for name in self.numbers if (values := self.by_seed(name))}
+
+    @property
+    def finished(self) -> tuple[RunResult, ...]:
+        """The results of finished trainings; empty if the scores are from a file."""
+        return tuple(result for result in self.results if result.state == "finished")
+
+    def by_seed(self, name: str) -> list[float]:
+        """Returns the finished seeds' scores by this name, without seeds that lack it."""
+        return [value for value in self.numbers.get(name, ()) if value is not None]
+
+
+def read_arm(claim: Claim, name: str, plan: Plan, known: Mapping[str, RunResult], read: ReadScores) -> ArmScores:
+    """Reads what has been measured so far of one of a claim's arms.
+
+    Args:
+        known: the result of each cell of the plan, by name.
+        read: reads the clips' scores of a run: :func:`rsjax.tools.studies.paper.measurements.read_scores`, which claims
+            that share trainings may cache.
+    """
+    cells = plan.of(claim.name, name)
+    results = tuple(known[cell.name] for cell in cells)
+    finished = [result for result in results if result.state == "finished"]
+    keys = [result.run.keys() for result in finished]
+    arm = ArmScores(
+        name=name,
+        planned=len(cells),
+        seeds=tuple(result.run.config.train.seed for result in finished),
+        trainings=tuple(result.name for result in finished),
+        clips=tuple(key["collect"] for key in keys),
+        numbers=_numbers(claim, finished, read),
+        scores=_scores(claim, name, finished, read),
+        absent=plan.absent.get((claim.name, name), ""),
+        results=results,
+    )
+    return _with_costs(arm, cells[0].config, finished) if finished else arm
+
+
+def _numbers(claim: Claim, finished: Sequence[RunResult], read: ReadScores) -> dict[str, list[float | None]]:
+    """Returns the scores over all clips: of the claim's metrics, of baselines, and those shown beside them."""
+    compared = dict.fromkeys(each.metric for each in claim.comparisons)
+    names = dict.fromkeys([*compared, *(f"{name}{suffix}" for name in compared for suffix in BASELINES), CEILING])
+    found: dict[str, list[float | None]] = {}
+    for name in names:
+        found[name] = [rounded(result.metrics.get(name), SEED_DIGITS) for result in finished]
+    for name, source in claim.beside.items():
+        measured = [read(result.run, source)[0].get(name) for result in finished]
+        found[name] = [None if each is None else rounded(float(np.mean(each)), SEED_DIGITS) for each in measured]
+    return {name: values for name, values in found.items() if any(value is not None for value in values)}
+
+
+def _scores(claim: Claim, arm: str, finished: Sequence[RunResult], read: ReadScores) -> dict[str, dict[str, Scored]]:
+    """Returns the clips' scores that the claim's comparisons need of an arm."""
+    found: dict[str, dict[str, Scored]] = {}
+    for comparison in claim.comparisons if finished else ():
+        for side, score in ((comparison.better, comparison.score), (comparison.than, comparison.than_score)):
+            if side == arm:
+                name = score or comparison.metric
+                scored = _scored(finished, comparison.measurement, name, comparison.metric, read)
+                found.setdefault(comparison.measurement, {})[name] = scored
+    return found
+
+
+def _scored(finished: Sequence[RunResult], source: str, score: str, metric: str, read: ReadScores) -> Scored:
+    """Returns the clips' scores by one name, if all finished seeds have them."""
+    rows = []
+    for result in finished:
+        scores, reason = read(result.run, source)
+        if score not in scores:
+            return Scored(reason=reason or result.reasons.get(metric) or f"no score named {score}")
+        values = np.asarray(scores[score], float)
+        rows.append(tuple(rounded(float(value), CLIP_DIGITS) or 0.0 for value in values))
+    return Scored(tuple(rows))
+
+
+def rounded(value: float | None, digits: int) -> float | None:
+    """Returns a number with so many significant digits; NaN stays NaN and None stays None."""
+    return value if value is None or math.isnan(value) else float(f"{value:.{digits}g}")
+
+
+def _with_costs(arm: ArmScores, config: Config, finished: Sequence[RunResult]) -> ArmScores:
+    """Returns the arm with its steps, parameters, operations and mean minutes of training."""
+    seconds = [sum(result.run.seconds(stage) for stage in ("tokenizer", "world_model")) for result in finished]
+    model, autoencoder = budget.parameters(config)
+    trained = model + autoencoder * (config.tokenizer_train.steps > 0)
+    frozen = model + autoencoder - trained
+    return replace(
+        arm,
+        parameters=f"{trained / 1e6:.2f} M" + (f", {frozen / 1e6:.2f} M frozen" if frozen else ""),
+        steps=None if config.train.curriculum else config.train.steps,
+        tflop=round(sum(budget.training_cost(config, "flops")) / 1e12, 1),
+        minutes=round(sum(seconds) / len(seconds) / 60, 1),
+    )

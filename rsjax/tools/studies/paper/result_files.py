@@ -1,0 +1,158 @@
+"""Files of results: what a study measured for a claim, from which documents make their tables and figures.
+
+``NAME.json`` has the claim, where and how it was measured, and its arms with the scores of every seed and clip. If it
+would be larger than :data:`MOST_BYTES`, the clips' scores are in ``NAME.npz`` beside it.
+"""
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, fields
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rsjax.files import FileError, read_json, write_file
+from rsjax.tools.pipeline.provenance import read_starts
+from rsjax.tools.pipeline.run import Run
+from rsjax.tools.studies.paper.arm_scores import CLIP_DIGITS, ArmScores, Scored, rounded
+from rsjax.tools.studies.paper.claim import Arm, Claim, Comparison
+from rsjax.tools.studies.paper.judge import Outcome, judge_claim
+
+KIND = "measured"
+MOST_BYTES = 300_000
+OF_CLAIM = ("name", "title", "statement", "place", "notes", "beside")
+
+
+def write_result(path: Path, outcome: Outcome, about: Mapping[str, Any], most: int = MOST_BYTES) -> None:
+    """Writes what was measured for a claim.
+
+    Args:
+        path: of the JSON file.
+        about: the command and the sizes of the study.
+        most: the size from which the clips' scores are written beside it.
+
+    Raises:
+        FileError: the disk is full.
+    """
+    claim = outcome.claim
+    content: dict[str, Any] = {"kind": KIND, **about, **provenance([run for arm in outcome.arms for run in _runs(arm)])}
+    content["claim"] = {name: getattr(claim, name) for name in OF_CLAIM}
+    content["claim"]["comparisons"] = [asdict(each) for each in claim.comparisons]
+    content["arms"] = [_arm_content(arm, claim.arm(arm.name)) for arm in outcome.arms]
+    text = _text(content)
+    path.with_suffix(".npz").unlink(missing_ok=True)
+    if len(text) > most:
+        arrays: dict[str, Any] = {}
+        for arm in content["arms"]:
+            for source, scores in arm["scores"].items():
+                for name, scored in scores.items():
+                    for number, row in enumerate(scored["rows"]):
+                        # As float32: the digits that are kept do not need more, and reading rounds to them again.
+                        arrays[json.dumps([arm["name"], source, name, number])] = np.array(row, np.float32)
+                    scored["rows"] = len(scored["rows"])
+        buffer = BytesIO()
+        np.savez_compressed(buffer, **arrays)
+        write_file(path.with_suffix(".npz"), buffer.getvalue())
+        text = _text(content)
+    write_file(path, text.encode())
+
+
+def read_result(path: Path) -> Outcome:
+    """Reads a file of results, and judges the claim anew.
+
+    Raises:
+        FileError: the file is missing, damaged or of another version.
+    """
+    content = read_json(path)
+    try:
+        arms = content["arms"]
+        claim = Claim(
+            **content["claim"]
+            | {
+                "arms": tuple(Arm(arm["name"], equal=arm["equal"], published=arm["published"]) for arm in arms),
+                "comparisons": tuple(Comparison(**each) for each in content["claim"]["comparisons"]),
+                "notes": tuple(content["claim"]["notes"]),
+            }
+        )
+        return judge_claim(claim, [_arm_scores(arm, path.with_suffix(".npz")) for arm in arms])
+    except (KeyError, TypeError, ValueError) as error:
+        raise FileError(f"{path}: damaged or of another version ({error!r}); add it again from its study") from error
+
+
+def about_result(path: Path) -> str:
+    """Returns where a file's numbers are from: commit, machine and date."""
+    content = read_json(path)
+    commits = [commit[:7] for commit in content["commits"]]
+    parts = [f"commit {', '.join(commits)}" if commits else "", ", ".join(content["machines"]), content["dates"]]
+    return "; ".join(part for part in parts if part)
+
+
+def content_key(path: Path) -> str:
+    """Returns a hash of a file of results and of the scores beside it."""
+    digest = hashlib.sha256(path.read_bytes())
+    beside = path.with_suffix(".npz")
+    if beside.exists():
+        digest.update(beside.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def provenance(runs: Sequence[Run]) -> dict[str, Any]:
+    """Returns the commits, machines and dates of the starts of some runs."""
+    starts = [start for run in runs for start in read_starts(run.directory)]
+    commits = [f"{s['code']['revision']}{' with changes' * bool(s['code']['dirty'])}" for s in starts]
+    machines = [f"{s['machine']['cpu_cores']} cores, {s['machine']['device_kind']}" for s in starts]
+    days = sorted({start["time"][:10] for start in starts})
+    return {
+        "commits": list(dict.fromkeys(commits)),
+        "machines": list(dict.fromkeys(machines)),
+        "dates": " to ".join(dict.fromkeys([*days[:1], *days[-1:]])),
+    }
+
+
+def _runs(arm: ArmScores) -> list[Run]:
+    return [result.run for result in arm.finished]
+
+
+def _arm_content(arm: ArmScores, of_claim: Arm) -> dict[str, Any]:
+    """Returns an arm as JSON; NaN is null."""
+    content = {field.name: getattr(arm, field.name) for field in fields(ArmScores) if field.name != "results"}
+    scores: dict[str, dict[str, Any]] = {}
+    for source, by_name in arm.scores.items():
+        scores[source] = {}
+        for name, scored in by_name.items():
+            rows = [[None if np.isnan(value) else value for value in row] for row in scored.rows]
+            scores[source][name] = {"rows": rows, "reason": scored.reason}
+    return content | {"equal": of_claim.equal, "published": dict(of_claim.published), "scores": scores}
+
+
+def _arm_scores(content: Mapping[str, Any], beside: Path) -> ArmScores:
+    """Returns an arm from its JSON, and from the file beside it."""
+    names = {field.name for field in fields(ArmScores)} - {"results"}
+    scores: dict[str, dict[str, Scored]] = {}
+    for source, by_name in content["scores"].items():
+        scores[source] = {}
+        for name, scored in by_name.items():
+            rows = scored["rows"]
+            if isinstance(rows, int):
+                with np.load(beside) as arrays:
+                    keys = [json.dumps([content["name"], source, name, number]) for number in range(rows)]
+                    rows = [[rounded(float(value), CLIP_DIGITS) for value in arrays[key]] for key in keys]
+            numbers = tuple(tuple(np.nan if value is None else float(value) for value in row) for row in rows)
+            scores[source][name] = Scored(numbers, scored["reason"])
+    values = {name: content[name] for name in names} | {"scores": scores}
+    return ArmScores(**values | {name: tuple(values[name]) for name in ("seeds", "trainings", "clips")})
+
+
+def _text(content: Mapping[str, Any]) -> str:
+    """Returns JSON with a line for each entry of the outer two levels of objects, so that differences can be read."""
+    lines = []
+    for key, value in content.items():
+        if isinstance(value, list) and value and isinstance(value[0], dict):
+            inner = ",\n  ".join(json.dumps(each, ensure_ascii=False) for each in value)
+            lines.append(f' "{key}": [\n  {inner}\n ]')
+        else:
+            lines.append(f' "{key}": {json.dumps(value, ensure_ascii=False)}')
+    return "{\n" + ",\n".join(lines) + "\n}\n"
