@@ -11,7 +11,7 @@ import tyro
 from experiments.cli import main_errors, parse
 from rsjax.config import require
 from rsjax.runtime import tune_process
-from rsjax.tools.studies.ablation.grid import DEFAULT_AXES, Choice, expand, parse_axes
+from rsjax.tools.studies.ablation.grid import Choice, chosen_grid
 
 PROG = "python -m experiments.ablation"
 TASK = "SLURM_ARRAY_TASK_ID"
@@ -22,7 +22,8 @@ class Options:
     """Options of this command."""
 
     grid: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """FIELD=VALUE,VALUE…: a field to vary; repeat the option for more. Default: depth on/off, keypoints on/off."""
+    """FIELD=VALUE,VALUE…: a field to vary; repeat the option for more. Or a named grid: physics (how depth is used ×
+    the keypoint term; the default) or weights (λ₁, λ₂, λ₃, γ, K and N₀, one at a time)."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Seeds of the world model's training (train.seed); every combination runs with each."""
     out: Path | None = None
@@ -48,7 +49,7 @@ def main() -> None:
     config, options = parse(sys.argv[1:], PROG, "Runs a grid of configurations and compares them.", Options())
     out = options.out or Path("runs") / f"ablation-{config.name}"
     data = options.data_dir
-    grid = expand(config, parse_axes(config, options.grid or DEFAULT_AXES), options.seeds)
+    grid = chosen_grid(config, options.grid or ("physics",), options.seeds)
     number = options.cell
     if number is None and not options.list and (task := os.environ.get(TASK)):
         require(

@@ -21,12 +21,22 @@ from rsjax.progress import note
 
 Value = bool | int | float | str
 
-DEFAULT_AXES = ("model.depth=branch,head,none", "model.loss.keypoints=printed,none")
+PHYSICS = ("model.depth=none,branch,head", "model.loss.keypoints=none,printed,difference,motion")
+WEIGHTS = (  # λ₁, λ₂, λ₃, γ, K and N₀ in equal ratios around the usual values
+    "model.loss.depth_weight=0.1,0.3,1,3,10",
+    "model.loss.keypoint_weight=0.001,0.003,0.01,0.03,0.1",
+    "model.loss.attention_weight=0.1,0.3,1,3,10",
+    "model.loss.gamma=1.25,2.5,5,10,20",
+    "model.loss.num_keypoints=8,16,32,64,128",
+    "sim.tracks=64,128,256,512,1024",
+)
+NAMES = ("physics", "weights")  # named grids
 SWITCHES = {  # a field → the switch that is "none" where the field has no effect
     "model.loss.depth_weight": "model.depth",
     "model.loss.keypoint_weight": "model.loss.keypoints",
     "model.loss.attention_weight": "model.loss.keypoints",
     "model.loss.gamma": "model.loss.keypoints",
+    "model.loss.attention": "model.loss.keypoints",
     "model.loss.num_keypoints": "model.loss.keypoints",
 }
 SEED = "train.seed"
@@ -99,7 +109,7 @@ def parse_axes(base: Config, texts: Sequence[str]) -> dict[str, tuple[Value, ...
         name, _, values = text.partition("=")
         field = name.strip().lstrip("-").replace("-", "_")
         for wrong, cure in (
-            (not values, f"write FIELD=VALUE,VALUE, such as {DEFAULT_AXES[0]}"),
+            (not values, f"write FIELD=VALUE,VALUE, such as {PHYSICS[0]}, or {' or '.join(NAMES)} alone"),
             (field not in known, f"no field {field!r}{did_you_mean(field, known)}"),
             (field == SEED, f"seeds have their own option, --seeds {values.replace(',', ' ')}"),
             (field == "name", "the preset's name has no effect; vary another field"),
@@ -136,8 +146,44 @@ def parse_value(name: str, kind: Any, text: str) -> Value:
     raise ConfigError(f"{name} is {text!r} in the grid; it takes {NUMBERS[kind]}")
 
 
+def chosen_grid(base: Config, texts: Sequence[str], seeds: Sequence[int]) -> Grid:
+    """Returns the grid that ``--grid`` names: all combinations of ``FIELD=VALUE,VALUE…`` arguments, or a named grid.
+
+    Raises:
+        ConfigError: as for :func:`parse_axes` and :func:`expand`.
+    """
+    if tuple(texts) == ("physics",):
+        return expand(base, parse_axes(base, PHYSICS), seeds)
+    if tuple(texts) == ("weights",):
+        return expand_each(base, parse_axes(base, WEIGHTS), seeds)
+    return expand(base, parse_axes(base, texts), seeds)
+
+
 def expand(base: Config, axes: Mapping[str, Sequence[Value]], seeds: Sequence[int]) -> Grid:
-    """Returns all cells. The last axis changes fastest and the seed slowest, so a stopped grid has complete tables.
+    """Returns the cells of all combinations. The last axis changes fastest.
+
+    Raises:
+        ConfigError: as for :func:`make_grid`.
+    """
+    combinations = [dict(zip(axes, values, strict=True)) for values in itertools.product(*axes.values())]
+    return make_grid(base, tuple(axes), combinations, seeds)
+
+
+def expand_each(base: Config, axes: Mapping[str, Sequence[Value]], seeds: Sequence[int]) -> Grid:
+    """Returns the base's cell, and those in which one field has another of its values and the others the base's.
+
+    Raises:
+        ConfigError: as for :func:`make_grid`.
+    """
+    usual = values_of(base, tuple(axes))
+    others = [usual | {field: value} for field, values in axes.items() for value in values if value != usual[field]]
+    return make_grid(base, tuple(axes), [usual, *others], seeds)
+
+
+def make_grid(
+    base: Config, fields: tuple[str, ...], combinations: Sequence[Mapping[str, Value]], seeds: Sequence[int]
+) -> Grid:
+    """Returns the cells of these combinations. The seed changes slowest, so a stopped grid has complete tables.
 
     Raises:
         ConfigError: there is no seed, or a seed is repeated or outside [0, 2³²); or some cells cannot run, and the
@@ -148,14 +194,13 @@ def expand(base: Config, axes: Mapping[str, Sequence[Value]], seeds: Sequence[in
     require(all(0 <= seed < 2**32 for seed in seeds), f"{flag}: a seed lies between 0 and 2^32 - 1")
     cells = dict[str, Config]()
     wrong = list[str]()
-    for seed, combination in itertools.product(seeds, itertools.product(*axes.values())):
-        values = dict(zip(axes, combination, strict=True))
+    for seed, values in itertools.product(seeds, combinations):
         try:
             cells[cell_name(values, seed)] = with_values(base, {**values, SEED: seed})
         except ConfigError as error:
             wrong.append(f"{cell_name(values, seed)}: {error}")
     require(not wrong, f"{len(wrong)} of {len(wrong) + len(cells)} cells cannot run; the first is {''.join(wrong[:1])}")
-    return Grid(tuple(axes), cells)
+    return Grid(fields, cells)
 
 
 def values_of(config: Config, fields: Sequence[str]) -> dict[str, Value]:

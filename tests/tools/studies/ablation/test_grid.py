@@ -5,6 +5,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -12,13 +13,14 @@ from hypothesis import strategies as st
 from rsjax.config import ConfigError, presets
 from rsjax.config.config_fields import config_fields, with_values
 from rsjax.tools.studies.ablation.grid import (
-    DEFAULT_AXES,
     SEED,
     SWITCHES,
+    WEIGHTS,
     Choice,
     Grid,
     add_cells,
     cell_name,
+    chosen_grid,
     expand,
     merge,
     parse_axes,
@@ -81,10 +83,27 @@ def test_without_axes_there_is_a_cell_per_seed() -> None:
     assert list(toy.grid(seeds=(4, 2)).cells) == ["seed=4", "seed=2"]
 
 
-def test_the_default_is_ways_to_use_depth_with_keypoints_on_and_off() -> None:
-    ways = ("branch", "head", "none")
-    models = map(toy.roboscape, toy.grid(*DEFAULT_AXES).cells.values())
-    assert [(m.depth.kind, m.loss.keypoints) for m in models] == list(product(ways, ("printed", "none")))
+def test_the_grid_of_physics_is_how_depth_is_used_by_the_keypoint_term() -> None:
+    models = map(toy.roboscape, chosen_grid(presets.tiny(), ["physics"], [0]).cells.values())
+    ways = ("none", "branch", "head")
+    terms = ("none", "printed", "difference", "motion")
+    assert [(m.depth.kind, m.loss.keypoints) for m in models] == list(product(ways, terms))
+
+
+def test_the_grid_of_weights_varies_one_field_at_a_time_in_equal_ratios() -> None:
+    tiny = presets.tiny()
+    grid = chosen_grid(tiny, ["weights"], [0, 1])
+    usual = values_of(tiny, grid.fields)
+    changed = [
+        [field for field, value in values_of(config, grid.fields).items() if value != usual[field]]
+        for config in grid.cells.values()
+        if config.train.seed == 1
+    ]
+    assert changed == [[]] + [[field] for field in grid.fields for _ in range(4)]
+    for field, values in parse_axes(tiny, WEIGHTS).items():
+        steps = np.diff(np.log(np.array(values, float)))
+        assert np.all(np.abs(steps - np.log(3)) < 0.11) or np.allclose(steps, np.log(2)), field
+        assert usual[field] in values
 
 
 def test_the_named_fields_exist() -> None:
@@ -161,7 +180,7 @@ def test_a_weight_of_a_term_that_is_off_is_reported() -> None:
 
 
 def test_cells_are_chosen_by_number_name_and_pattern() -> None:
-    names = list(toy.grid(*DEFAULT_AXES, seeds=(0, 1)).cells)
+    names = list(toy.grid("model.depth=branch,head,none", "model.loss.keypoints=printed,none", seeds=(0, 1)).cells)
     assert list(Choice().of(names)) == names
     assert list(Choice(number=3).of(names)) == [names[3]]
     assert list(Choice(only=("*seed=1", names[0])).of(names)) == [names[0], *names[6:]]
