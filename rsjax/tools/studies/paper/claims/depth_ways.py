@@ -1,0 +1,40 @@
+"""Ways to use depth, beside models without it, at equal time, operations and steps."""
+
+from dataclasses import replace
+from typing import Literal
+
+from rsjax.tools.studies.paper.claim import Arm, Claim, pairs, register
+
+_METRICS = ("psnr", "psnr_motion", "delta_psnr", "ssim")
+
+# Without keypoint terms, which have claims of their own.
+_ALONE = {"model.loss.keypoints": "none"}
+_ARMS = (
+    Arm("second head", {"model.depth": "head", **_ALONE}),
+    Arm("branch (the paper's)", _ALONE),
+    Arm("Genie", model="genie"),
+    Arm("no depth, twice the blocks", {"model.depth": "none", "model.blocks": 8, "model.unroll": 8, **_ALONE}),
+)
+
+
+def _register(name: str, equal: Literal["seconds", "flops", "steps"], title: str, rank: int) -> None:
+    register(
+        Claim(
+            name=name,
+            title=f"Depth as a second head at equal {title}",
+            statement="Depth predicted by a second head on the branch of RGB makes the better world model.",
+            place="a choice of ours beside §2.3",
+            arms=tuple(replace(arm, equal=equal) for arm in _ARMS),
+            comparisons=tuple(pair for arm in _ARMS[1:] for pair in pairs(_ARMS[0].name, arm.name, *_METRICS)),
+            rank=rank,
+            notes=(
+                f"All arms train for equal {title}, each with the learning rate of the preset.",
+                "No arm has keypoint terms. Twice the blocks without depth are the paper's branches without depth.",
+            ),
+        )
+    )
+
+
+_register("depth-ways", "seconds", "time", 2)
+_register("depth-ways-flops", "flops", "operations", 4)
+_register("depth-ways-steps", "steps", "steps", 4)

@@ -1,0 +1,34 @@
+"""Keypoint terms beside that of Eq. 5, on a model whose second head predicts depth."""
+
+from typing import Any
+
+from rsjax.tools.studies.paper.claim import Arm, Claim, pairs, register
+
+_HEAD = {"model.depth": "head"}
+_TERMS: dict[str, dict[str, Any]] = {
+    "printed Eq. 5 and 7": {},
+    "difference of codes": {"model.loss.keypoints": "difference", "model.loss.attention_weight": 0.0},
+    "motion head": {"model.loss.keypoints": "motion", "model.loss.attention_weight": 0.0},
+    "features along a track": {"model.loss.keypoints": "feature", "model.loss.attention_weight": 0.0},
+    "one normalised weight": {"model.loss.keypoint_weight": 0.0, "model.loss.attention": "normalised"},
+}
+
+register(
+    Claim(
+        name="keypoint-terms",
+        title="Keypoint terms whose minimum is the truth",
+        statement="A term on tracked points that the true video minimises makes moving regions better.",
+        place="choices of ours beside Eq. 5 and 7",
+        arms=(
+            Arm("without", _HEAD | {"model.loss.keypoints": "none"}),
+            *(Arm(name, _HEAD | values) for name, values in _TERMS.items()),
+        ),
+        comparisons=tuple(
+            pair
+            for name in _TERMS
+            for pair in pairs(name, "without", "psnr_motion", "cube_error_widths", "gripper_error_widths", "psnr")
+        ),
+        rank=3,
+        notes=("All arms train for the same steps. The terms that are not in the paper come without Eq. 7.",),
+    )
+)
