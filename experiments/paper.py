@@ -4,6 +4,7 @@ import shlex
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from experiments.cli import main_errors, parse_options
 from rsjax.config import presets, require
@@ -34,6 +35,9 @@ class Options:
     """The preset that the trainings vary."""
     seeds: int = 3
     """Trainings of each arm."""
+    vary: Literal["auto", "model", "everything"] = "auto"
+    """What differs between the seeds: the training of the model alone, or clips and tokenizer too. Default: everything
+    from a budget of 12 hours on, where it costs little."""
     weights: str = ""
     """A directory with the weights of LPIPS and FVD (docs/evaluation.md). Default: the preset's."""
     depth_estimator: str = ""
@@ -54,12 +58,16 @@ def main() -> None:
     preset = with_values(presets.get(options.preset), given)
     # This import loads JAX, so it comes after the arguments have been parsed.
     from rsjax.tools.studies.paper import run
-    from rsjax.tools.studies.paper.budget import parse_duration, scale
+    from rsjax.tools.studies.paper.budget import VARY_EVERYTHING, parse_duration, scale
     from rsjax.tools.studies.paper.claim import chosen, claims
     from rsjax.tools.studies.paper.plan import make_plan
 
     wanted = chosen(options.only, claims())
-    plan = make_plan(wanted, scale(preset, parse_duration(options.budget)), options.data_dir, options.seeds)
+    seconds = parse_duration(options.budget)
+    vary = options.vary
+    if vary == "auto":
+        vary = "everything" if seconds >= VARY_EVERYTHING else "model"
+    plan = make_plan(wanted, scale(preset, seconds), options.data_dir, options.seeds, vary)
     command = shlex.join([*PROG.split(), *sys.argv[1:]])
     run.print_plan(plan, options.dir, options.data_dir)
     if options.dry_run:

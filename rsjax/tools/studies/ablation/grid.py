@@ -40,6 +40,7 @@ SWITCHES = {  # a field → the switch that is "none" where the field has no eff
     "model.loss.num_keypoints": "model.loss.keypoints",
 }
 SEED = "train.seed"
+OTHER_SEEDS = ("tokenizer_train.seed", "sim.seed")  # what a seed of everything decides too: the tokenizer, the clips
 FILE = "grid.json"
 LIBRARIES = ("rsjax", "jax", "flax", "optax", "numpy")  # libraries whose versions the file records
 NAME_LENGTH = 180  # limit for a cell's directory: file systems allow 255, and temporary files add suffixes

@@ -52,6 +52,7 @@ SEEDS = 3
 _UNITS = {"s": 1, "sec": 1, "min": 60, "m": 60, "h": 3600, "d": 86400}
 _TERM = re.compile(r"(\d+(?:\.\d+)?)\s*(" + "|".join(sorted(_UNITS, key=len, reverse=True)) + r")\s*")
 HOUR = 3600.0
+VARY_EVERYTHING = 12 * HOUR  # from this budget on, where clips and tokenizers of each seed take little of it
 
 
 def parse_duration(text: str) -> float:
@@ -89,9 +90,11 @@ def scale(preset: Config, seconds: float) -> Scale:
     each = SPENT_IN_CELLS * seconds / (CELLS * (seconds / (HOUR / 2)) ** GROWTH)
     episodes = min(sim.episodes, max(LEAST_EPISODES, _round(COLLECT_SHARE * seconds / EPISODE)))
     rollouts = ROLLOUTS_SHARE * each / ROLLOUT
+    # Small budgets allow for one draw of random actions when they size a cell. The preset's further draws come on top,
+    # in the estimate of every evaluation, so that fewer trainings fit, but none is shorter.
     draws = evaluation.action_draws
-    draws = draws if rollouts >= evaluation.clips * (1 + 2 * draws) else 1
-    clips = max(LEAST_CLIPS, min(_round(rollouts / (1 + 2 * draws)), episodes // 6))
+    sized_for = draws if rollouts >= evaluation.clips * (1 + 2 * draws) else 1
+    clips = max(LEAST_CLIPS, min(_round(rollouts / (1 + 2 * sized_for)), episodes // 6))
     clips = min(evaluation.clips, sim.test_episodes, clips)
     per_step = tokenizer_step_seconds(preset)
     tokenizer_steps = min(tokenizer.steps, max(LEAST_TOKENIZER_STEPS, _round(TOKENIZER_SHARE * seconds / per_step)))
@@ -107,7 +110,7 @@ def scale(preset: Config, seconds: float) -> Scale:
         "runtime.eval_every": 0,
     }
     base = with_values(preset, values)
-    steps = (each - START - evaluation_seconds(base)) / step_seconds(base)
+    steps = (each - START - evaluation_seconds(base, sized_for)) / step_seconds(base)
     base = with_steps(base, min(preset.train.steps, max(LEAST_STEPS, _round(steps))))
     return Scale(seconds, base)
 

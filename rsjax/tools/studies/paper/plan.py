@@ -6,16 +6,17 @@ from pathlib import Path
 from typing import Literal
 
 from rsjax.config import ComponentConfig, Config, ConfigError, CurriculumStageConfig, SimConfig, metaworld, presets
-from rsjax.config.config_fields import with_values
+from rsjax.config.config_fields import config_fields, with_values
 from rsjax.tools.pipeline.run import Run
 from rsjax.tools.sim import expert
-from rsjax.tools.studies.ablation.grid import SEED, Value, cell_name
+from rsjax.tools.studies.ablation.grid import OTHER_SEEDS, SEED, Value, cell_name
 from rsjax.tools.studies.paper import budget
 from rsjax.tools.studies.paper.budget import Scale
 from rsjax.tools.studies.paper.claim import Arm, Claim
 from rsjax.tools.studies.paper.measurements import seconds_of
 
 SLACK = 1.05  # share of the budget that the estimates may take
+Vary = Literal["model", "everything"]  # a seed decides the model's training; or the clips and the tokenizer as well
 VERDICT_SEEDS = 2  # seeds of each arm that a verdict needs
 KEPT = ("prompt_frames", "sim", "data", "eval")  # parts of the base preset's configuration that all arms have
 
@@ -75,7 +76,9 @@ class Plan:
         return tuple(cell for cell in self.cells.values() if (claim, arm) in cell.uses)
 
 
-def make_plan(claims: Sequence[Claim], scale: Scale, data: Path, seeds: int = budget.SEEDS) -> Plan:
+def make_plan(
+    claims: Sequence[Claim], scale: Scale, data: Path, seeds: int = budget.SEEDS, vary: Vary = "model"
+) -> Plan:
     """Returns the cells of claims, which share the budget, and the tasks in their order.
 
     The sizes of the cells depend only on the budget, not on the claims.
@@ -83,6 +86,7 @@ def make_plan(claims: Sequence[Claim], scale: Scale, data: Path, seeds: int = bu
     Args:
         data: the directory of simulated data sets.
         seeds: the number of trainings of each arm.
+        vary: what differs between the trainings of an arm.
     """
     absent: dict[tuple[str, str], str] = {}
     cells: dict[str, Cell] = {}  # by content key
@@ -90,7 +94,7 @@ def make_plan(claims: Sequence[Claim], scale: Scale, data: Path, seeds: int = bu
     made = set[str]()
     for claim, arm, seed in _ordered(claims, range(seeds)):
         try:
-            config = arm_config(arm, scale, seed)
+            config = arm_config(arm, scale, seed, vary)
         except ConfigError as error:
             absent[claim.name, arm.name] = str(error)
             continue
@@ -151,8 +155,10 @@ def _label(arm: Arm) -> dict[str, Value]:
     return {**family, **arm.values, **stages, **shares}
 
 
-def arm_config(arm: Arm, scale: Scale, seed: int) -> Config:
+def arm_config(arm: Arm, scale: Scale, seed: int, vary: Vary = "model") -> Config:
     """Returns the configuration of an arm with a seed.
+
+    Seed 0 of everything is seed 0 of the model alone: clips and tokenizer are the preset's.
 
     Raises:
         ConfigError: there is no such preset, or the base preset lacks a field of the arm's.
@@ -161,6 +167,8 @@ def arm_config(arm: Arm, scale: Scale, seed: int) -> Config:
     config = _small(arm, base) if arm.preset else base.with_family(arm.model) if arm.model else base
     try:
         config = with_values(config, {**arm.values, SEED: seed})
+        if vary == "everything":
+            config = with_values(config, {name: config_fields(config)[name].value + seed for name in OTHER_SEEDS})
     except (AttributeError, TypeError) as error:
         raise ConfigError(f"the preset {config.name} has no such field ({error})") from error
     if arm.equal != "steps":

@@ -223,6 +223,28 @@ def test_more_seeds_are_more_trainings() -> None:
     assert [cell.config.train.seed for cell in plan.of("table2", "full")] == [0, 1, 2, 3, 4]
 
 
+def test_seeds_of_everything_have_their_own_clips_and_tokenizers_which_their_arms_share() -> None:
+    at = scale(TINY, 3 * HOUR)
+    claim = chosen(["table2"], claims())
+    model, everything = (make_plan(claim, at, DATA, seeds=3, vary=vary) for vary in ("model", "everything"))
+    made = [Run(cell.config, Path(), DATA).keys() for cell in everything.cells.values()]
+    for stage, number in (("collect", 3), ("tokenizer", 3), ("world_model", 12)):
+        assert len({keys[stage] for keys in made}) == number
+    of_seed_0 = [name for name, cell in model.cells.items() if cell.config.train.seed == 0]
+    assert of_seed_0 == [name for name in everything.cells if name in model.cells]
+    tasks = [sum(task.seconds for task in (*plan.tasks, *plan.left_out)) for plan in (model, everything)]
+    own = 2 * (budget.collect_seconds(at.base) + budget.tokenizer_seconds(at.base))
+    assert tasks[1] - tasks[0] == pytest.approx(own)
+
+
+def test_random_actions_are_drawn_as_often_as_the_preset_says_and_cost_their_time() -> None:
+    for hours in (0.5, 3, 12, 48):
+        base = scale(TINY, hours * HOUR).base
+        assert base.eval.action_draws == TINY.eval.action_draws == 3
+        extra = budget.evaluation_seconds(base) - budget.evaluation_seconds(base, draws=1)
+        assert extra == pytest.approx(4 * base.eval.clips * budget.ROLLOUT)
+
+
 def test_an_arm_that_cannot_be_trained_is_absent_with_its_reason(capsys: pytest.CaptureFixture[str]) -> None:
     claim = replace(toy.claim(), arms=(*toy.claim().arms, Arm("other", preset="other"), Arm("odd", {"model.x": 1})))
     plan = toy.plan(claim)
