@@ -49,7 +49,7 @@ FIRST_FIELDS = {
     "model.sample.steps": "Decoding steps per generated frame.",
     "eval.clips": "Test clips to evaluate on.",
     "eval.weights": "A directory with the weights of LPIPS and FVD (see docs/evaluation.md).",
-    "eval.depth-estimator": "A network that estimates depth from frames (see docs/evaluation.md).",
+    "eval.depth-estimator": "What estimates depth from frames: simulator, or a network (see docs/evaluation.md).",
 }
 
 REGISTRY = tyro.constructors.ConstructorRegistry()

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from experiments.cli import main_errors, parse_options
-from rsjax.config import presets, require
+from rsjax.config import SIMULATOR, presets, require
 from rsjax.config.config_fields import with_values
 from rsjax.runtime import tune_process
 
@@ -40,8 +40,8 @@ class Options:
     from a budget of 12 hours on, where it costs little."""
     weights: str = ""
     """A directory with the weights of LPIPS and FVD (docs/evaluation.md). Default: the preset's."""
-    depth_estimator: str = ""
-    """A network that estimates depth (docs/evaluation.md)."""
+    depth_estimator: str = SIMULATOR
+    """What estimates depth (docs/evaluation.md): simulator, a small network that learns from the clips, or another."""
     dry_run: bool = False
     """Print the trainings with their estimated minutes and states, and run nothing."""
     report: bool = False

@@ -20,7 +20,7 @@ from rsjax.config.fields import (
     to_dict,
 )
 from rsjax.config.model import ModelConfig, families, register_family
-from rsjax.config.run import Config, EvalConfig
+from rsjax.config.run import SIMULATOR, WEIGHTS, Config, EvalConfig
 from rsjax.config.sim import SimConfig
 from rsjax.config.token_model import (
     CorruptionConfig,
@@ -49,6 +49,8 @@ from rsjax.config.train import (
 )
 
 __all__ = [
+    "SIMULATOR",
+    "WEIGHTS",
     "AdamW",
     "AdversarialConfig",
     "ClipShape",

@@ -14,6 +14,8 @@ from rsjax.config.tokenizer import TokenizerConfig, TokenizerTrainConfig
 from rsjax.config.train import LoopConfig, RuntimeConfig, TrainConfig
 
 WEIGHTS = "weights"  # the directory of metrics' files unless a run names another one
+SIMULATOR = "simulator"  # the depth estimator that learns from the run's clips
+SIMULATOR_STEPS = 2000  # its training steps
 
 
 @dataclass(frozen=True)
@@ -30,7 +32,9 @@ class EvalConfig:
     # python -m experiments.convert lpips, and i3d_torchscript.pt for FVD. Without its file, a metric is null. Only the
     # default directory may be missing; "": no files.
     weights: str = WEIGHTS
-    depth_estimator: str = ""  # a network and its files, as in experiments.ingest --depth
+    # What estimates depth from frames: simulator, a small network that learns from the run's own clips (or, with fewer
+    # or more steps, simulator:steps=500), or a network and its files, as in experiments.ingest --depth.
+    depth_estimator: str = ""
 
     def __post_init__(self) -> None:
         require_range(
@@ -44,6 +48,20 @@ class EvalConfig:
             "report_clips",
             "localiser_steps",
         )
+        require(
+            not self.depth_estimator.startswith(SIMULATOR) or self.simulator_steps > 0,
+            f"eval.depth_estimator is {self.depth_estimator!r}; write {SIMULATOR} or {SIMULATOR}:steps=500",
+        )
+
+    @property
+    def simulator_steps(self) -> int:
+        """Training steps of the estimator that learns from the run's clips; 0 if another or none is chosen."""
+        if self.depth_estimator == SIMULATOR:
+            return SIMULATOR_STEPS
+        steps = self.depth_estimator.removeprefix(f"{SIMULATOR}:steps=")
+        if steps == self.depth_estimator or not (steps.isascii() and steps.isdigit()):
+            return 0
+        return int(steps)
 
     def weights_file(self, name: str) -> str:
         """Returns the path of a metric's file in the directory ``weights``; "" if it is not there.

@@ -40,17 +40,23 @@ def estimate_depth(
 
     Some networks estimate 1/depth only up to a scale and a shift, which are arbitrary. Their output for both videos of
     a clip is therefore stretched by the same map: to 1 at the recorded video's nearest point and 10 at its farthest.
+
+    Args:
+        predictions: by the suffix of the scores' names; "" is the model's own prediction.
     """
     recorded = np.empty(truth.shape[:-1], np.float32)
     generated = {name: np.empty_like(recorded) for name in predictions}
+    units = set()
     with Progress("depth estimation", len(truth) * (1 + len(predictions)), "videos") as progress:
         for clip, frames in enumerate(truth):
             reference = estimator(frames)
+            units.add(reference.unit)
             recorded[clip] = _in_unit_of(reference, reference)
             for name, videos in predictions.items():
                 generated[name][clip] = _in_unit_of(reference, estimator(videos[clip]))
             progress.update((clip + 1) * (1 + len(predictions)))
-    return {name: EstimatedDepth(recorded, depth) for name, depth in generated.items()}
+    metres = units == {"metres"}
+    return {name: EstimatedDepth(recorded, depth, metres, baseline=name != "") for name, depth in generated.items()}
 
 
 def _in_unit_of(reference: DepthMaps, depth: DepthMaps) -> Float32[np.ndarray, "T H W"]:

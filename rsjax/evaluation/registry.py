@@ -35,10 +35,14 @@ class EstimatedDepth:
     Attributes:
         truth: of the recorded frames, > 0, in metres or relative (see :func:`rsjax.data.depth_color.stretch`).
         prediction: of the generated frames, in the same unit.
+        metres: whether this unit is metres.
+        baseline: whether the frames are a baseline's, so that the error on the recorded frames is already scored.
     """
 
     truth: Float[np.ndarray, "B T H W"]
     prediction: Float[np.ndarray, "B T H W"]
+    metres: bool = False
+    baseline: bool = False
 
 
 @dataclass(frozen=True)

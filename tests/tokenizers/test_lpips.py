@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
-from rsjax.config.run import WEIGHTS
+from rsjax.config import WEIGHTS
 from rsjax.evaluation.metrics.lpips import FILES, how_to_get
 from rsjax.tokenizers.lpips import NETS, LpipsError, load_lpips, lpips, lpips_shapes, min_size
 

@@ -10,7 +10,7 @@ from typing import Literal, TypeAlias, get_args
 import numpy as np
 from jaxtyping import Bool, Float
 
-from rsjax.evaluation.registry import PerClip, PerFrame, Scene, Unavailable, metric
+from rsjax.evaluation.registry import PerClip, PerFrame, Scene, Scores, Unavailable, metric
 
 Alignment = Literal["none", "median", "affine_disparity", "l1_scale"]
 DepthSource = Literal["branch", "estimator"]
@@ -24,6 +24,7 @@ _MEASURES: dict[Measure, tuple[str, Literal["higher", "lower"], int]] = {
     "delta2": ("depth δ₂", "higher", 3),
 }
 
+_NO_ESTIMATOR = "no estimator: --eval.depth-estimator simulator, or NETWORK:FIELD=PATH (docs/evaluation.md)"
 _MIN_PREDICTION = 1e-3
 _L1_STEPS = 10
 _MIN_L1_SCALE = 1e-3
@@ -103,6 +104,47 @@ def _register(measure: Measure, alignment: Alignment, source: DepthSource) -> No
         return scene.shared(_scores, alignment, source).per_clip(measure)
 
 
+def _register_exact(measure: Measure) -> None:
+    """Registers one score of estimated depth against exact depth; ``…_truth`` is the estimator's own error."""
+    title, better, decimals = _MEASURES[measure]
+
+    def per_frame(scene: Scene) -> PerFrame:
+        return scene.shared(_exact_scores)[""].per_frame(measure)
+
+    @metric(
+        f"depth_{measure}_exact_estimator",
+        f"{title}, estimator, exact",
+        better=better,
+        decimals=decimals,
+        interval=measure == "absrel",
+        column=False,
+        per_frame=per_frame,
+    )
+    def score(scene: Scene) -> Scores:
+        return {part: scores.per_clip(measure) for part, scores in scene.shared(_exact_scores).items()}
+
+
+def _exact_scores(scene: Scene) -> dict[str, DepthScores]:
+    """Scores the depth estimated from generated frames against the recorded depth, both in metres.
+
+    Returns:
+        The scores by part of the metric's name; "_truth", the estimator's own error on recorded frames, only once.
+    """
+    estimated = scene.estimated
+    if estimated is None:
+        raise Unavailable(_NO_ESTIMATOR)
+    if not estimated.metres:
+        raise Unavailable("the estimator's depth is not in metres")
+    rows = scene.truth.has_depth
+    if scene.truth.depth is None or not rows.any():
+        raise Unavailable("no test clip has depth in metres")
+    exact = scene.truth.depth[rows, scene.prompt_frames :]
+    scores = {"": depth_scores(exact, estimated.prediction[rows, scene.prompt_frames :], "none")}
+    if not estimated.baseline:
+        scores["_truth"] = depth_scores(exact, estimated.truth[rows, scene.prompt_frames :], "none")
+    return scores
+
+
 def _scores(scene: Scene, alignment: Alignment, source: DepthSource) -> DepthScores:
     truth, predicted = _branch_depth(scene) if source == "branch" else _estimated_depth(scene)
     first = scene.prompt_frames
@@ -124,7 +166,7 @@ def _branch_depth(scene: Scene) -> tuple[Depths, Depths]:
 
 def _estimated_depth(scene: Scene) -> tuple[Depths, Depths]:
     if scene.estimated is None:
-        raise Unavailable("no estimator: --eval.depth-estimator NETWORK:FIELD=PATH (docs/evaluation.md)")
+        raise Unavailable(_NO_ESTIMATOR)
     return scene.estimated.truth, scene.estimated.prediction
 
 
@@ -248,6 +290,7 @@ def result_key(metric: str, alignment: Alignment = "none", source: DepthSource =
 
 for _measure in get_args(Measure):
     _register(_measure, "none", "branch")
+    _register_exact(_measure)
 for _source in get_args(DepthSource):
     for _alignment in ("median", "affine_disparity", "l1_scale"):
         for _measure in get_args(Measure):

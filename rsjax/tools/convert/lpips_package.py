@@ -19,7 +19,7 @@ from typing import Any, Literal
 import numpy as np
 from flax.traverse_util import flatten_dict
 
-from rsjax.config.run import WEIGHTS
+from rsjax.config import WEIGHTS
 from rsjax.errors import first_line
 from rsjax.evaluation.metrics.lpips import FILES
 from rsjax.progress import note

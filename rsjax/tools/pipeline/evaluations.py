@@ -23,8 +23,9 @@ from rsjax.files import FileError, disk_guard, making, safe_id
 from rsjax.models.load_run import load, load_config
 from rsjax.models.trained import TrainedModel
 from rsjax.progress import note
+from rsjax.tools.pipeline.depth_stage import check_depth, depth_estimator
 from rsjax.tools.pipeline.evaluation_clips import chosen_splits, evaluation_store, with_second_takes
-from rsjax.tools.pipeline.metric_files import by_content, check_metric_files, load_estimator
+from rsjax.tools.pipeline.metric_files import by_content, check_metric_files
 from rsjax.tools.pipeline.provenance import code_version, data_fingerprint, machine, training_settings
 from rsjax.tools.pipeline.run import RECIPE, Run
 from rsjax.tools.pipeline.run_clips import relocated
@@ -83,6 +84,7 @@ def evaluate_run(directory: Path, data: Path, request: Request) -> Iterator[Path
     trained = _sampling(replace(load(directory), config=config), protocol)
     run = Run(config, directory, data)
     store = run.open_clips()
+    check_depth(run)
     if request.data:
         scored_store = open_store(request.data)
     else:
@@ -159,7 +161,7 @@ def _evaluate(
         for old in folder.glob("parts-*"):
             if old != parts:  # from an evaluation with other settings that never finished
                 shutil.rmtree(old, ignore_errors=True)
-        estimator = load_estimator(trained.config.eval)
+        estimator = depth_estimator(run)
         found = evaluation.evaluate(trained, store, eval_clips=eval_clips, folder=parts, estimator=estimator)
         about = {"label": name, "key": key, "code": code_version(Path(rsjax.__file__).resolve().parents[1])}
         about |= _described(trained, run, store, eval_clips)

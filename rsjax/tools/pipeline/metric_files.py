@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
-from rsjax.config import ConfigError, EvalConfig, require
+from rsjax.config import SIMULATOR, ConfigError, EvalConfig, require
 from rsjax.evaluation import evaluate as evaluation
 from rsjax.evaluation.depth_estimator import DepthEstimator, DepthMaps
 from rsjax.evaluation.metrics import fvd
@@ -35,7 +35,9 @@ def check_metric_files(settings: EvalConfig) -> None:
 
 
 def load_estimator(settings: EvalConfig) -> DepthEstimator | None:
-    """Loads the network that ``eval.depth_estimator`` names; returns None if the setting is empty.
+    """Loads the network that ``eval.depth_estimator`` names; returns None if it names none.
+
+    The estimator that learns from a run's clips is made by :mod:`rsjax.tools.pipeline.depth_stage`.
 
     Raises:
         ConfigError: there is no such network or field, or a file that the setting names is missing.
@@ -79,8 +81,8 @@ class Estimator:
 
 
 def _annotator(settings: EvalConfig) -> Any:
-    """Returns the annotator that ``eval.depth_estimator`` names, not yet loaded; None if the setting is empty."""
-    if not settings.depth_estimator:
+    """Returns the annotator that ``eval.depth_estimator`` names, not yet loaded; None if it names no network."""
+    if not settings.depth_estimator or settings.simulator_steps:
         return None
     try:
         annotator = choose("depth", settings.depth_estimator)
@@ -104,6 +106,8 @@ def by_content(settings: EvalConfig) -> EvalConfig:
     files = {name: settings.weights_file(name) for name in (*FILES.values(), fvd.FILE)}
     weights = [f"{name}:{content_hash(Path(path))}" for name, path in files.items() if path]
     hashes: dict[str, Any] = {"weights": ",".join(weights)}
+    if settings.simulator_steps:
+        hashes["depth_estimator"] = f"{SIMULATOR}:steps={settings.simulator_steps}"
     annotator = _annotator(settings)
     if annotator is not None:
         fields = []

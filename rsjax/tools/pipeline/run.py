@@ -21,13 +21,13 @@ from rsjax.errors import UserError
 from rsjax.files import FileError, holder, lock, read_json, write_json
 from rsjax.tools.sim.collect import collection_key
 
-STAGES = ("collect", "tokenizer", "tokens", "world_model", "evaluation", "report")
+STAGES = ("collect", "tokenizer", "tokens", "world_model", "evaluation", "report")  # and, if asked for, depth_estimator
 TRAINED = ("tokenizer", "world_model")  # replaced only with --overwrite
 DECIDED_BY = {  # sections of the configuration that a trained stage depends on
     "tokenizer": ("sim", "data", "tokenizer", "tokenizer_train"),
     "world_model": ("sim", "data", "tokenizer", "tokenizer_train", "model", "prompt_frames", "train"),
 }
-OUTPUTS = {  # in the run directory; clips are elsewhere, and "tokens" is a link
+OUTPUTS = {  # in the run directory; clips and depth estimator are elsewhere, and "tokens" is a link
     "tokenizer": "tokenizer/weights",
     "tokens": "tokens/store",
     "world_model": "world_model/weights",
@@ -51,8 +51,11 @@ class Run:
 
     @property
     def stages(self) -> tuple[str, ...]:
-        """The stages of this run; a model without tokens needs no tokenizer."""
-        return tuple(stage for stage in STAGES if stage != "tokenizer" or self.config.model.uses_tokenizer)
+        """The stages of this run; a model without tokens needs no tokenizer, and few runs train a depth estimator."""
+        stages = [stage for stage in STAGES if stage != "tokenizer" or self.config.model.uses_tokenizer]
+        if self.config.eval.simulator_steps:
+            stages.insert(stages.index("evaluation"), "depth_estimator")
+        return tuple(stages)
 
     @property
     def clips(self) -> Path:
@@ -99,10 +102,15 @@ class Run:
         return prepared.get("key") == tokens_key(key, tokenizer)
 
     def keys(self) -> dict[str, str]:
-        """Returns each stage's content key, a hash of its settings and the previous stage's key."""
+        """Returns each stage's content key, a hash of its settings and the previous stage's key.
+
+        The key of the depth estimator depends on the clips alone, so that all runs on the same clips share it.
+        """
         cfg = self.config
         key = self._collect_key
         keys = {"collect": key}
+        if cfg.eval.simulator_steps:
+            keys["depth_estimator"] = content_key(RECIPE, "depth_estimator", key, cfg.eval.simulator_steps)
         settings: dict[str, tuple[Any, ...]] = {
             "tokenizer": (cfg.autoencoder, cfg.tokenizer_train),
             "tokens": cfg.model.token_shifts,
@@ -194,7 +202,11 @@ class Run:
 
     def output(self, stage: str) -> Path:
         """Returns the path of the stage's output, a file or directory that is written atomically."""
-        return self.clips if stage == "collect" else self.directory / OUTPUTS[stage]
+        if stage == "collect":
+            return self.clips
+        if stage == "depth_estimator":
+            return self.data_directory / f"depth-estimator-{self.keys()[stage]}"
+        return self.directory / OUTPUTS[stage]
 
     def finished(self, stage: str) -> bool:
         """Returns whether the stage's output exists and was made by this configuration."""

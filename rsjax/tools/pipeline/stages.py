@@ -15,6 +15,7 @@ from rsjax.files import disk_guard
 from rsjax.models.base import Assets, create_autoencoder, create_model
 from rsjax.models.load_run import load_tokenizer
 from rsjax.progress import Progress, duration, note, stage
+from rsjax.tools.pipeline.depth_stage import check_depth, make_depth_network
 from rsjax.tools.pipeline.evaluations import evaluate_own
 from rsjax.tools.pipeline.limits import check_batch, check_episodes
 from rsjax.tools.pipeline.metric_files import check_metric_files
@@ -50,6 +51,8 @@ def run_all(run: Run, resume: bool = True, command: str = "") -> None:
         _do(run, "tokens", prepare)
     if _begins(run, "world_model", "training the world model"):
         _do(run, "world_model", train_world_model, resume)
+    if _begins(run, "depth_estimator", "training the depth estimator on the clips' exact depth"):
+        _do(run, "depth_estimator", make_depth_network)
     if _begins(run, "evaluation", "evaluating on the test split"):
         _do(run, "evaluation", evaluate)
     if _begins(run, "report", "writing the report"):
@@ -106,6 +109,7 @@ def check_before_start(run: Run) -> None:
         create_model(cfg).check_files()
     if not run.finished("evaluation"):
         check_metric_files(cfg.eval)
+        check_depth(run)
 
 
 def note_changes(run: Run, command: str) -> None:
@@ -213,7 +217,7 @@ def train_world_model(run: Run, resume: bool) -> None:
 
 
 def evaluate(run: Run) -> None:
-    """Stage 5: computes the scores, and the arrays of the report."""
+    """Computes the scores, and the arrays of the report."""
     with disk_guard(run.directory):
         save_evaluation(run.output("evaluation"), evaluate_own(run))
 

@@ -9,7 +9,7 @@ from rsjax.evaluation.results import Evaluation, load_evaluation
 from rsjax.files import write_json
 from rsjax.models.roboscape.objective import motion_magnitude
 from rsjax.tools.pipeline.provenance import read_starts
-from rsjax.tools.pipeline.run import STAGES, TRAINED, Run
+from rsjax.tools.pipeline.run import TRAINED, Run
 from rsjax.tools.studies.report.figures import ClipFigure
 from rsjax.tools.studies.report.page import RunReport, write_report
 from rsjax.training.log import read_log
@@ -24,7 +24,7 @@ def write_summary(run: Run, command: str) -> None:
         command: the command that repeats the run.
     """
     result = load_evaluation(run.output("evaluation"))
-    seconds = {stage: run.seconds(stage) for stage in STAGES[:-1] if run.mark(stage)}
+    seconds = {stage: run.seconds(stage) for stage in run.stages[:-1] if run.mark(stage)}
     metrics = result.metrics | {"seconds_total": round(sum(seconds.values()), 1)}
     cfg = run.config
     report = RunReport(

@@ -228,3 +228,39 @@ def test_scores_share_one_fit(monkeypatch):
 def test_what_cannot_be_scored_has_a_reason(name, changes, reason):
     with pytest.raises(Unavailable, match=reason):
         metrics()[name].function(_scene(**changes))
+
+
+def _estimated(seed, **changes):
+    truth, prediction = _videos(seed, (4, 4, 6, 7))
+    return EstimatedDepth(truth, prediction, **{"metres": True, **changes})
+
+
+def test_estimated_depth_is_scored_against_exact_depth():
+    estimated = _estimated(3)
+    scene = _scene(estimated=estimated)
+    exact = scene.truth.depth[:, 1:]
+    for measure in ("absrel", "delta1", "delta2"):
+        scored = metrics()[f"depth_{measure}_exact_estimator"]
+        scores = scored.function(scene)
+        assert scores.keys() == {"", "_truth"}
+        for part, depths in (("", estimated.prediction), ("_truth", estimated.truth)):
+            expected = depth_scores(exact, depths[:, 1:], "none").per_clip(measure)
+            np.testing.assert_array_equal(scores[part], expected)
+        np.testing.assert_allclose(scored.per_frame(scene).mean(-1), scores[""], rtol=1e-6)
+        baseline = scored.function(_scene(estimated=dataclasses.replace(estimated, baseline=True)))
+        np.testing.assert_array_equal(baseline[""], scores[""])
+        assert baseline.keys() == {""}
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"estimated": None}, "no estimator: --eval.depth-estimator simulator"),
+        ({"estimated": _estimated(3, metres=False)}, "the estimator's depth is not in metres"),
+        ({"estimated": _estimated(3), "truth": Video(_scene().truth.rgb)}, "no test clip has depth in metres"),
+    ],
+)
+def test_without_exact_depth_or_metres_there_is_a_reason(changes, reason):
+    with pytest.raises(Unavailable) as caught:
+        metrics()["depth_absrel_exact_estimator"].function(_scene(**changes))
+    assert reason in str(caught.value)

@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import jax
 
-from rsjax.config import Config, TokenizerConfig, TokenModelConfig, TrainConfig, require
+from rsjax.config import SIMULATOR, Config, TokenizerConfig, TokenModelConfig, TrainConfig, require
 from rsjax.config.config_fields import with_values
 from rsjax.models.base import create_autoencoder, create_model
 from rsjax.tokenizers.autoencoder import Autoencoder
@@ -33,10 +33,13 @@ FAMILY_STEPS = {"irasim": (0.13, 0.34), "cogvideox": (0.85, 0.50), "ivideogpt": 
 FAMILY_EPISODES = {"irasim": 29.0, "ivideogpt": 3.4}
 EVALUATION = 30.0  # seconds per evaluation
 LOCALISER = 0.106  # seconds per step of the localiser
+# Seconds per step of the depth estimator that learns from the clips, for frames of 64 pixels: 0.126 of processor time.
+DEPTH_STEP = 0.08
 ROLLOUT = 0.18  # seconds per rollout
 
 COLLECT_SHARE = 0.06  # shares of a budget
 TOKENIZER_SHARE = 0.08
+DEPTH_SHARE = 0.02
 SPENT_IN_CELLS = 0.85
 ROLLOUTS_SHARE = 0.12  # shares of a cell
 LOCALISER_SHARE = 0.04
@@ -109,6 +112,9 @@ def scale(preset: Config, seconds: float) -> Scale:
         "train.curriculum": (),  # its epochs would determine the steps; a claim's arms have their own
         "runtime.eval_every": 0,
     }
+    if evaluation.simulator_steps:
+        depth_steps = max(1, _round(DEPTH_SHARE * seconds / _depth_step_seconds(preset)))
+        values["eval.depth_estimator"] = f"{SIMULATOR}:steps={min(evaluation.simulator_steps, depth_steps)}"
     base = with_values(preset, values)
     steps = (each - START - evaluation_seconds(base, sized_for)) / step_seconds(base)
     base = with_steps(base, min(preset.train.steps, max(LEAST_STEPS, _round(steps))))
@@ -183,6 +189,16 @@ def _image_flops(tokenizer: TokenizerConfig, image_size: int) -> int:
 def collect_seconds(config: Config) -> float:
     """Returns the seconds of the simulation."""
     return 0.0 if config.data is not None else EPISODE * config.sim.episodes
+
+
+def depth_estimator_seconds(config: Config) -> float:
+    """Returns the seconds of training the depth estimator; 0 if none learns from the clips."""
+    steps = config.eval.simulator_steps
+    return START + steps * _depth_step_seconds(config) if steps else 0.0
+
+
+def _depth_step_seconds(config: Config) -> float:
+    return DEPTH_STEP * (config.clips.image_size / 64) ** 2
 
 
 def tokenizer_seconds(config: Config) -> float:

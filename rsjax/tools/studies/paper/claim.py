@@ -138,6 +138,10 @@ class Claim:
         return tuple(dict.fromkeys([*filter(None, used), *self.beside.values()]))
 
 
+# The depth errors that models without depth have, too: an estimator's, by the protocol that the paper follows.
+ESTIMATED_DEPTH = tuple(f"depth_{name}_median_estimator" for name in ("absrel", "delta1", "delta2"))
+
+
 def pairs(better: str, than: str, *metrics: str) -> tuple[Comparison, ...]:
     """Returns comparisons of two arms, one for each of these metrics."""
     return tuple(Comparison(metric, better, than) for metric in metrics)

@@ -125,6 +125,7 @@ def _new_seconds(config: Config, keys: Mapping[str, str], made: set[str]) -> flo
         "collect": budget.collect_seconds,
         "tokenizer": budget.tokenizer_seconds,
         "world_model": budget.model_seconds,
+        "depth_estimator": budget.depth_estimator_seconds,
     }
     new = [stage for stage in parts if stage in keys and keys[stage] not in made]
     made.update(keys[stage] for stage in new)

@@ -38,6 +38,9 @@ _DEPTH_ROWS = (
     ("_median_estimator", "estimator, median scale"),
     ("_affine_disparity_estimator", "estimator, scale and shift of 1/depth"),
     ("_l1_scale_estimator", "estimator, L1 scale"),
+    ("_exact_estimator", "estimator against exact depth, in metres"),
+    ("_exact_estimator_tokenizer", "the same, of the tokenizer's reconstruction"),
+    ("_exact_estimator_truth", "the same, of the true frames"),
 )
 _DEPTH_COLUMNS = (("depth_absrel{}", "AbsRel ↓", 4), ("depth_delta1{}", "δ₁ ↑", 3), ("depth_delta2{}", "δ₂ ↑", 3))
 _CONTROL_ROWS = (("", "another clip's actions"), ("_uniform", "uniform random actions"))

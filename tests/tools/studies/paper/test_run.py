@@ -239,7 +239,8 @@ def test_a_run_of_the_preset_is_a_cell_and_its_scores_are_in_the_report(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(claim_tables, "draw", draw)
-    options = ("--preset", "debug", "--budget", "3h", "--dir", tmp_path, "--data-dir", command.data)
+    places = ("--dir", tmp_path, "--data-dir", command.data)
+    options = ("--preset", "debug", "--budget", "3h", "--depth-estimator", "", *places)
     main(*options, "--only", "table2", "--dry-run")
     lines = capsys.readouterr().out.splitlines()
     assert not list(tmp_path.iterdir())

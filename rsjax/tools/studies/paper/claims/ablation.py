@@ -3,10 +3,8 @@
 from typing import Any
 
 from rsjax.tools.studies.compare.published import published_by_metric
-from rsjax.tools.studies.paper.claim import Arm, Claim, pairs, register
+from rsjax.tools.studies.paper.claim import ESTIMATED_DEPTH, Arm, Claim, pairs, register
 
-# Depth errors must be an estimator's, since the model without depth has them too.
-_DEPTH = tuple(f"depth_{name}_median_estimator" for name in ("absrel", "delta1", "delta2"))
 _WITHOUT: dict[str, dict[str, Any]] = {
     "w/o depth": {"model.depth": "none"},
     "w/o keypoints": {"model.loss.keypoints": "none"},
@@ -32,8 +30,8 @@ register(
         ),
         comparisons=(
             *pairs("full", "w/o both", "psnr", "psnr_motion", "delta_psnr", "ssim", "cube_error_widths", "lpips_alex"),
-            *pairs("full", "w/o depth", "psnr", "delta_psnr", *_DEPTH),
-            *pairs("full", "w/o keypoints", "psnr", "delta_psnr", "depth_absrel", *_DEPTH),
+            *pairs("full", "w/o depth", "psnr", "delta_psnr", *ESTIMATED_DEPTH),
+            *pairs("full", "w/o keypoints", "psnr", "delta_psnr", "depth_absrel", *ESTIMATED_DEPTH),
         ),
         rank=0,
         notes=(

@@ -10,14 +10,14 @@ from rsjax.evaluation.protocols import PROTOCOLS
 from rsjax.evaluation.registry import Unavailable
 from rsjax.models.load_run import load
 from rsjax.progress import Progress
+from rsjax.tools.pipeline.depth_stage import depth_estimator
 from rsjax.tools.pipeline.evaluation_clips import longer_episodes
-from rsjax.tools.pipeline.metric_files import load_estimator
 from rsjax.tools.pipeline.run import Run
 from rsjax.tools.sim.collect import collect, collection_key
 from rsjax.tools.sim.unseen import collect_unseen, unseen_splits
 from rsjax.tools.studies.compare.published import published_by_metric
 from rsjax.tools.studies.paper import budget
-from rsjax.tools.studies.paper.claim import Arm, Claim, Comparison, register
+from rsjax.tools.studies.paper.claim import ESTIMATED_DEPTH, Arm, Claim, Comparison, register
 from rsjax.tools.studies.paper.claims.baselines import RATES
 from rsjax.tools.studies.paper.measurements import FOLDER, Scores, measurement
 
@@ -29,7 +29,7 @@ def _by_protocol(run: Run, name: str, store: Store, split: str, draws: int) -> S
     protocol = replace(PROTOCOLS[name], clips=run.config.eval.clips, action_draws=draws, splits=(split,))
     eval_clips = EvaluationClips.read(store, split, protocol, run.config.clips)
     parts = run.directory / FOLDER / f"{name}-{split}"
-    estimator = load_estimator(run.config.eval)
+    estimator = depth_estimator(run)
     result = evaluate(load(run.directory), run.open_clips(), eval_clips=eval_clips, folder=parts, estimator=estimator)
     shutil.rmtree(parts, ignore_errors=True)
     return result.per_clip
@@ -119,7 +119,7 @@ register(
         comparisons=tuple(
             Comparison(metric, "RoboScape", "Genie", measurement=name)
             for name in _PLACES.values()
-            for metric in ("psnr", "depth_absrel_median_estimator", "delta_psnr", "psnr_motion")
+            for metric in ("psnr", *ESTIMATED_DEPTH, "delta_psnr", "psnr_motion")
         ),
         rank=2,
         notes=(

@@ -1,8 +1,8 @@
 """Figures 6 and 7: larger models and more data."""
 
-from rsjax.tools.studies.paper.claim import Arm, Claim, pairs, register
+from rsjax.tools.studies.paper.claim import ESTIMATED_DEPTH, Arm, Claim, pairs, register
 
-_METRICS = ("psnr", "delta_psnr", "depth_absrel", "ssim")
+_METRICS = ("psnr", "delta_psnr", "lpips_alex", "depth_absrel", *ESTIMATED_DEPTH, "ssim")
 
 register(
     Claim(
