@@ -33,6 +33,7 @@ from rsjax.config.token_model import (
     PublicCodeConfig,
     RoboScapeConfig,
     SampleConfig,
+    SmallDepthBranch,
     TokenModelConfig,
     TransformerConfig,
 )
@@ -77,6 +78,7 @@ __all__ = [
     "RuntimeConfig",
     "SampleConfig",
     "SimConfig",
+    "SmallDepthBranch",
     "TokenModelConfig",
     "TokenizerConfig",
     "TokenizerTrainConfig",

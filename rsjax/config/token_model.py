@@ -294,6 +294,28 @@ class DepthBranch:
 
 
 @dataclass(frozen=True)
+class SmallDepthBranch:
+    """A depth branch as in the paper, but narrower, shallower or at coarser cells, and so cheaper, than RGB's.
+
+    With another width or coarser cells it has positions and an action encoder of its own, and W^l of Eq. 3 is
+    rectangular.
+    """
+
+    kind: ClassVar[Literal["small_branch"]] = "small_branch"
+    width: int = 0  # channels, a multiple of a head's, which is as wide as RGB's; 0: as many as RGB's
+    # A divisor of RGB's; 0: as many. They are spread evenly: of RGB's blocks, every (blocks / these)-th, from the first
+    # on, has one beside it, so that geometry joins RGB at every level (Eq. 3), and RGB blocks follow that use it.
+    blocks: int = 0
+    # Cells of depth are cells × cells tokens, embedded together. The features of a cell join RGB in all of them, and
+    # the head predicts all of its tokens.
+    cells: int = 1
+
+    def __post_init__(self) -> None:
+        require_range(self, "model.depth", 0, math.inf, "width", "blocks")
+        require_range(self, "model.depth", 1, math.inf, "cells")
+
+
+@dataclass(frozen=True)
 class DepthHead:
     """Depth tokens are embedded beside RGB's in one branch of blocks, and a second head on its output predicts them.
 
@@ -315,8 +337,29 @@ class NoDepth:
 class RoboScapeConfig(TokenModelConfig):
     """RoboScape: the dual-branch transformer with the physics-informed objective (paper §2.3)."""
 
-    depth: DepthBranch | DepthHead | NoDepth = DepthBranch()  # how depth is used
+    depth: DepthBranch | SmallDepthBranch | DepthHead | NoDepth = DepthBranch()  # how depth is used
     loss: LossConfig = LossConfig()  # λ₁, λ₂, λ₃ and γ
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not isinstance(self.depth, SmallDepthBranch):
+            return
+        require(
+            self.depth.width % self.head_width == 0,
+            f"model.depth.width is {self.depth.width}; make it a multiple of {self.head_width}, the channels of an "
+            f"attention head (model.width / model.heads)",
+        )
+        require(
+            self.depth.blocks == 0 or self.blocks % self.depth.blocks == 0,
+            f"model.depth.blocks is {self.depth.blocks}, which does not divide model.blocks {self.blocks}; change one "
+            f"of them",
+        )
+
+    @property
+    def scanned(self) -> int:
+        if isinstance(self.depth, SmallDepthBranch) and self.depth.blocks:
+            return self.depth.blocks
+        return self.blocks
 
     @property
     def uses_depth(self) -> bool:

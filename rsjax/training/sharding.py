@@ -267,7 +267,7 @@ RULES = (
     # Blocks are stacked on axis 0, which a scan iterates over; split there, each iteration would read from one device.
     Rule(r"(^|/)blocks/.*/kernel$", (2, 1)),  # (blocks, in, out)
     Rule(r"(^|/)blocks/.*/(bias|scale)$", (1,)),
-    Rule(r"(^|/)(embedding|pos_embed)$", (-1,)),  # width, so that a look-up reads its part of every row
+    Rule(r"(^|/)(embedding|(depth_)?pos_embed)$", (-1,)),  # width, so that a look-up reads its part of every row
     Rule(r"(^|/)kernel$", (-1, -2)),  # heads and convolutions: output channels, else input channels
 )
 

@@ -1,6 +1,6 @@
 """AbsRel and δ_k of predicted depth, under the alignments that published work uses.
 
-Depth is z-depth along the optical axis. A depth branch trained on metres needs no alignment. A monocular estimator's
+Depth is z-depth along the optical axis. Depth of a model trained on metres needs no alignment. A monocular estimator's
 output is known only up to a scale, or a scale and a shift, which are fitted to the truth once per video.
 """
 
@@ -281,7 +281,7 @@ def _video_scores(
 def result_key(metric: str, alignment: Alignment = "none", source: DepthSource = "branch") -> str:
     """Returns the name of a depth score in results, which is different for each protocol.
 
-    ``depth_absrel`` is the score of the depth branch in metres, unaligned; all other names contain the alignment and
+    ``depth_absrel`` is the score of the predicted depth in metres, unaligned; all other names contain the alignment and
     the source, such as ``depth_absrel_median_estimator``.
     """
     plain = alignment == "none" and source == "branch"

@@ -1,17 +1,16 @@
 """The architecture of a transformer: its settings, and sizes that follow from the clips and the tokenizer."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Literal
 
 from rsjax.config import (
     Config,
-    DepthBranch,
-    DepthHead,
-    NoDepth,
     RoboScapeConfig,
     SampleConfig,
+    SmallDepthBranch,
     TokenModelConfig,
     TransformerConfig,
+    require,
 )
 from rsjax.config.token_model import check_sampling
 from rsjax.models.roboscape.departures.integrated_actions import action_inputs
@@ -28,6 +27,9 @@ class Architecture(TransformerConfig):
         action_inputs: numbers per frame that the action encoder reads; 0: no encoder.
         depth: how the network uses depth: in a branch of its own (Eq. 2 and 3), by a second head on the RGB branch, or
             not at all.
+        depth_width: channels of the depth branch; 0: as many as RGB's.
+        depth_blocks: blocks of the depth branch; 0: as many as RGB's.
+        depth_cells: token cells along each side of one of the depth branch's cells.
         motion_head: whether training predicts how tracked points move
             (:mod:`rsjax.models.roboscape.departures.motion_head`).
         feature_dtype: of the features between layers; :func:`rsjax.models.roboscape.transformer.run_transformer` sets
@@ -40,8 +42,18 @@ class Architecture(TransformerConfig):
     vocabularies: int = 2
     action_inputs: int = 28
     depth: Literal["branch", "head", "none"] = "branch"
+    depth_width: int = 0
+    depth_blocks: int = 0
+    depth_cells: int = 1
     motion_head: bool = False
     feature_dtype: Literal["float32", "bfloat16"] = "float32"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(
+            self.grid % self.depth_cells == 0,
+            f"model.depth.cells is {self.depth_cells}, which does not divide the {self.grid} cells of a row; change it",
+        )
 
     @classmethod
     def create(cls, config: Config) -> "Architecture":
@@ -49,9 +61,14 @@ class Architecture(TransformerConfig):
         model = config.model
         clips = config.clips
         assert isinstance(model, TokenModelConfig)
-        depth: DepthBranch | DepthHead | NoDepth = NoDepth()
+        depth: Literal["branch", "head", "none"] = "none"
+        small = SmallDepthBranch()
         if isinstance(model, RoboScapeConfig):
-            depth = model.depth
+            if isinstance(model.depth, SmallDepthBranch):
+                depth = "branch"
+                small = model.depth
+            else:
+                depth = model.depth.kind
         inputs = 0
         if model.action_encoder != "none":
             inputs = action_inputs(model.departures, clips.action_dim)
@@ -62,7 +79,10 @@ class Architecture(TransformerConfig):
             code_bits=config.tokenizer.code_bits,
             vocabularies=config.tokenizer.vocabularies,
             action_inputs=inputs,
-            depth=depth.kind,
+            depth=depth,
+            depth_width=small.width,
+            depth_blocks=small.blocks,
+            depth_cells=small.cells,
             motion_head=model.keypoint_term == "motion",
         )
 
@@ -84,6 +104,32 @@ class Architecture(TransformerConfig):
         if self.depth == "branch":
             return ("rgb", "depth")
         return ("rgb",)
+
+    def sizes(self, modality: str) -> "Architecture":
+        """Returns the architecture with width, heads, blocks and grid of the branch that reads a modality."""
+        if modality == "rgb":
+            return self
+        width = self.depth_width or self.width
+        return replace(
+            self,
+            width=width,
+            heads=width // self.head_width,
+            blocks=self.depth_blocks or self.blocks,
+            grid=self.grid // self.depth_cells,
+            depth_cells=1,
+        )
+
+    @property
+    def groups(self) -> int:
+        """The number of equal groups of blocks that the network runs in turn; each has at most one block of depth."""
+        if self.depth == "branch":
+            return self.sizes("depth").blocks
+        return self.blocks
+
+    @property
+    def more_rgb(self) -> tuple[str, ...]:
+        """Names of a group's RGB blocks after its first, which has a depth block beside it."""
+        return tuple(f"rgb_{number}" for number in range(1, self.blocks // self.groups))
 
     @property
     def uncommitted(self) -> int:

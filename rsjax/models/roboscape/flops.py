@@ -15,18 +15,20 @@ def forward_flops(config: Architecture, frames: int) -> int:
 
     Temporal attention counts every pair of frames, though half of the pairs are masked.
     """
-    cells = config.grid**2
-    width = config.width
-    linear = 8 * width**2 + 2 * config.public.mlp_ratio * width**2  # qkv and proj of both attentions, fc1 and fc2
-    attention = 2 * (cells + frames) * width  # scores and weighted sums, over space and over time
-    head = width * config.vocabularies * config.vocabulary_size
-    per_cell = len(config.branches) * config.blocks * (linear + attention) + len(config.modalities) * head
+    depth = config.sizes("depth")
+    own_sizes = config.depth == "branch" and (depth.width, depth.grid) != (config.width, config.grid)
+    products = _blocks(config, frames) + _action_encoder(config)
     if config.depth == "branch":
-        per_cell += width**2 * config.blocks  # W of Eq. 3
-    encoder = config.action_inputs * width
-    if config.action_inputs and config.action_encoder == "mlp":
-        encoder += width**2
-    return 2 * frames * (cells * per_cell + encoder)
+        products += _blocks(depth, frames)
+        products += depth.blocks * depth.grid**2 * depth.width * config.width  # W of Eq. 3
+    if own_sizes:
+        products += _action_encoder(depth)
+    if config.depth_cells > 1:
+        tables = 1 + config.departures.read_previous
+        products += tables * config.grid**2 * depth.width**2  # of the embeddings of a coarse cell's tokens
+    for modality in config.modalities:  # the heads
+        products += config.grid**2 * config.sizes(modality).width * config.vocabularies * config.vocabulary_size
+    return 2 * frames * products
 
 
 def motion_head_flops(config: Architecture, frames: int) -> int:
@@ -34,3 +36,19 @@ def motion_head_flops(config: Architecture, frames: int) -> int:
     if not config.motion_head:
         return 0
     return 2 * frames * config.grid**2 * config.width * OUTPUTS
+
+
+def _blocks(sizes: Architecture, frames: int) -> int:
+    """Returns the multiplications in a frame's blocks of one branch."""
+    cells = sizes.grid**2
+    linear = 8 * sizes.width**2 + 2 * sizes.public.mlp_ratio * sizes.width**2  # qkv and proj twice, fc1 and fc2
+    attention = 2 * (cells + frames) * sizes.width  # scores and weighted sums, over space and over time
+    return sizes.blocks * cells * (linear + attention)
+
+
+def _action_encoder(sizes: Architecture) -> int:
+    """Returns the multiplications in a frame's action encoder of one branch."""
+    products = sizes.action_inputs * sizes.width
+    if sizes.action_inputs and sizes.action_encoder == "mlp":
+        products += sizes.width**2
+    return products

@@ -69,7 +69,7 @@ def shapes(own: Architecture, directory: Path) -> Params:
         free = FREE - {"action_encoder"}
         alike = ALIKE | {"integrate_actions"}
     if saved.depth == "none":
-        free = free | {"depth"}
+        free = free | {"depth", "depth_width", "depth_blocks", "depth_cells"}
     other = {field.name for field in fields(Departures)} - alike
     differing = "; ".join(
         filter(None, [differences(saved, own, free), differences(saved.departures, own.departures, other)])
@@ -92,7 +92,7 @@ def start(fresh: Params, saved: Params, directory: Path) -> Params:
     own = flatten_dict(fresh, sep="/")
     if "motion_head" not in fresh:
         saved = {name: part for name, part in saved.items() if name != "motion_head"}
-    params = flatten_dict(saved, sep="/")
+    params = _grouped(flatten_dict(saved, sep="/"), own)
     for path in params:
         if path not in own:
             raise UserError(f"{directory}: its {path} has no place in this model; keep the branches and the actions")
@@ -105,3 +105,19 @@ def start(fresh: Params, saved: Params, directory: Path) -> Params:
         if path not in params:
             params[path] = jnp.zeros_like(x) if path.startswith(joining) else x
     return unflatten_dict(params, sep="/")
+
+
+def _grouped(params: dict[str, jax.Array], own: dict[str, jax.Array]) -> dict[str, jax.Array]:
+    """Divides the stack of RGB blocks as this model does, if its depth branch has fewer blocks (``more_rgb``)."""
+    names = sorted({path.split("/")[1] for path in own if path.startswith("blocks/rgb")})  # rgb, rgb_1, …
+    if len(names) == 1 or any(path.startswith("blocks/rgb_1/") for path in params):
+        return params
+    grouped = {}
+    for path, x in params.items():
+        if not path.startswith("blocks/rgb/"):
+            grouped[path] = x
+            continue
+        for name in names:
+            first = int(name.removeprefix("rgb").removeprefix("_") or 0)
+            grouped[path.replace("blocks/rgb/", f"blocks/{name}/")] = x[first :: len(names)]
+    return grouped

@@ -556,7 +556,7 @@ def _repeat_step(
     past = prompt["rgb"].shape[1]
     beyond = past + actions.shape[1] > arch.frames
     params = for_many_passes(arch, params)
-    state = replace(state, cache=apart(state.cache, arch.blocks, arch.unroll))
+    state = replace(state, cache=apart(state.cache, arch.groups, arch.unroll))
     known = mean_codes.codes_of(sample, prompt, arch.code_bits) or prompt
     made = {branch: _with_room(cells, actions.shape[1]) for branch, cells in known.items()}
 
@@ -645,7 +645,7 @@ def for_many_passes(arch: Architecture, params: Params) -> Params:
     blocks = params["blocks"]
     if arch.compute_dtype == "bfloat16":
         blocks = rounded(blocks, ADDED_IN_BF16 if arch.feature_dtype == "bfloat16" else ())
-    return params | {"blocks": apart(blocks, arch.blocks, arch.unroll)}
+    return params | {"blocks": apart(blocks, arch.groups, arch.unroll)}
 
 
 def _with_room(cells: Array, frames: int) -> Array:

@@ -4,7 +4,7 @@ There is no temporal shift: the output at frame t predicts frame t, whose cells 
 that led from frame t-1 into frame t is added at frame t.
 
 Axes: B clips, T frames, H×W = S token cells, A action dimensions, n vocabularies of V codes, C width, h heads of
-e = C/h, q queries, k keys.
+e = C/h, q queries, k keys. A small depth branch has c ≤ C channels and s ≤ S cells.
 """
 
 from dataclasses import replace
@@ -26,6 +26,7 @@ from rsjax.layers.partition import gathers
 from rsjax.layers.platform import attend_in_clip, attend_over_cache, in_feature_dtype
 from rsjax.layers.unstacked_params import together
 from rsjax.models.roboscape.architecture import Architecture
+from rsjax.models.roboscape.coarse_cells import merged, split, spread
 from rsjax.models.roboscape.departures.action_dropout import with_null_action
 from rsjax.models.roboscape.departures.motion_head import MotionHead
 from rsjax.models.roboscape.departures.norms import optional_norm
@@ -37,7 +38,7 @@ from rsjax.trainable import Params
 
 # Each cell's token, or its code: the mean of each bit, in [-1, 1].
 Cells = Int[Array, "B T S"] | Float[Array, "B T S D"]
-StackedCache = dict[str, KeyValues]  # by branch
+StackedCache = dict[str, KeyValues]  # by the blocks' names in a :class:`DualBlock`
 Cache = StackedCache | list[StackedCache]  # of all blocks; or of each, split by rsjax.layers.unstacked_params
 
 Features = Float[Array, "B T S C"]
@@ -174,6 +175,8 @@ class STBlock(nn.Module):
 class DualBlock(nn.Module):
     """One block of each branch, then h_RGB += W(h_depth) (Eq. 3). Without depth, only the RGB block.
 
+    If the depth branch has fewer blocks (``config.depth_blocks``), more RGB blocks follow.
+
     Inputs and outputs are dicts by branch; the signature is that of ``nn.scan``.
     """
 
@@ -188,14 +191,20 @@ class DualBlock(nn.Module):
         new: dict[str, Any] = {}
         for branch, features in x.items():
             branch_cache = None if cache is None else cache[branch]
-            out[branch], new[branch] = STBlock(cfg, name=branch)(features, start, branch_cache)
+            out[branch], new[branch] = STBlock(cfg.sizes(branch), name=branch)(features, start, branch_cache)
         if "depth" in out:
             # The gradient of W needs it; recomputing it would be all that the depth block's MLP runs again for.
             out["depth"] = checkpoint_name(out["depth"], DEPTH)
             # Zero at first, so that pre-trained RGB weights keep their logits.
             bf16 = cfg.compute_dtype == "bfloat16"
             project = Dense(cfg.width, bf16, kernel_init=nn.initializers.zeros, name="depth_to_rgb")
-            out["rgb"] = out["rgb"] + project(out["depth"])
+            joining = project(out["depth"])
+            if cfg.depth_cells > 1:
+                joining = spread(joining, cfg.depth_cells)
+            out["rgb"] = out["rgb"] + joining
+        for name in cfg.more_rgb:
+            block_cache = None if cache is None else cache[name]
+            out["rgb"], new[name] = STBlock(cfg, name=name)(out["rgb"], start, block_cache)
         return out, None if cache is None else new
 
 
@@ -252,20 +261,21 @@ class Transformer(nn.Module):
         cells = {name: tokens[name].reshape(b, t, cfg.grid**2, *tokens[name].shape[4:]) for name in cfg.modalities}
 
         # Eq. 2: the sum of token, action and position embeddings, by branch.
-        shared = self._positions(t, start)
-        if cfg.action_inputs:
-            shared = shared + self._action(actions, drop_actions)
+        shared = dict.fromkeys(cfg.branches, self._shared(cfg, "", t, start, actions, drop_actions))
+        small = cfg.sizes("depth")
+        if "depth" in shared and (small.width, small.grid) != (cfg.width, cfg.grid):
+            shared["depth"] = self._shared(small, "depth_", t, start, actions, drop_actions)
         mask = hidden(departures, mask.reshape(b, t, cfg.grid**2), start)
         masks = dict.fromkeys(cfg.modalities, mask)
         if "depth" in masks and no_depth is not None:
             masks["depth"] = mask | no_depth[:, None, None]
-        x = {name: TokenEmbed(cfg, name=f"{name}_embed")(cells[name], masks[name]) for name in cfg.modalities}
-        x |= {branch: x[branch] + shared for branch in cfg.branches}
+        x = {name: self._embed(name, f"{name}_embed", cells[name], masks[name]) for name in cfg.modalities}
+        x |= {branch: x[branch] + shared[branch] for branch in cfg.branches}
         if departures.read_previous:
             previous = previous or {name: frame_before(frames) for name, frames in cells.items()}
             for name, before in previous.items():
                 absent = absent_cells(name, before, start, no_depth)
-                x[name] = x[name] + TokenEmbed(cfg, name=f"{name}_previous_embed")(before, absent)
+                x[name] = x[name] + self._embed(name, f"{name}_previous_embed", before, absent)
         if cfg.depth == "head":
             x = {"rgb": x["rgb"] + x["depth"]}
         x = {branch: features.astype(cfg.feature_dtype) for branch, features in x.items()}
@@ -276,8 +286,8 @@ class Transformer(nn.Module):
             variable_axes={"params": 0},
             split_rngs={"params": True},
             in_axes=(0, nn.broadcast),
-            length=cfg.blocks,
-            unroll=min(cfg.unroll, cfg.blocks),
+            length=cfg.groups,
+            unroll=min(cfg.unroll, cfg.groups),
         )
         new: Any
         x, new = blocks(cfg, name="blocks")(x, together(cache), start)
@@ -286,41 +296,71 @@ class Transformer(nn.Module):
             cache = put_frames(cache, new, start, departures.rotary)
         return {name: self._head(name, x.get(name, x["rgb"])) for name in cfg.modalities}, cache
 
-    def _positions(self, frames: int, start: Any) -> Float[Array, "T S C"]:
+    def _embed(self, modality: str, table: str, cells: Cells, mask: Bool[Array, "B T S"]) -> Float[Array, "B T s c"]:
+        """Returns the embeddings of a modality's cells, at the width and the cells of the branch that reads it."""
+        cfg = self.config.sizes(modality)
+        x = TokenEmbed(cfg, name=table)(cells, mask)
+        if cfg.grid == self.config.grid:
+            return x
+        return Dense(cfg.width, name=f"{table}_merge")(merged(x, self.config.depth_cells))
+
+    def _shared(
+        self,
+        cfg: Architecture,
+        prefix: str,
+        frames: int,
+        start: Any,
+        actions: Float[Array, "B T A"] | None,
+        drop: Bool[Array, " B"] | None,
+    ) -> Float[Array, "#B T S C"]:
+        """Returns the sum of position and action embeddings of a branch of these sizes.
+
+        Args:
+            prefix: of the parameters' names.
+        """
+        x = self._positions(cfg, prefix, frames, start)
+        if cfg.action_inputs:
+            x = x + self._action(cfg, prefix, actions, drop)
+        return x
+
+    def _positions(self, cfg: Architecture, prefix: str, frames: int, start: Any) -> Float[Array, "T S C"]:
         """Returns the embeddings of frames and cells, or with rotary positions those of cells alone, (1, S, C)."""
-        cfg = self.config
         if not cfg.departures.rotary and frames + (start if isinstance(start, int) else 0) > cfg.frames:
             raise ValueError(f"{frames} frames from {start} on; the model has learned positions for {cfg.frames}")
         learned = 1 if cfg.departures.rotary else cfg.frames
         init = nn.initializers.normal(cfg.departures.embedding_std)
-        position = self.param("pos_embed", init, (learned, cfg.grid**2, cfg.width))
+        position = self.param(f"{prefix}pos_embed", init, (learned, cfg.grid**2, cfg.width))
         if cfg.departures.rotary:
             return position
         return jax.lax.dynamic_slice_in_dim(position, start, frames, axis=0)
 
-    def _action(self, actions: Float[Array, "B T A"] | None, drop: Bool[Array, " B"] | None) -> Float[Array, "B T 1 C"]:
+    def _action(
+        self, cfg: Architecture, prefix: str, actions: Float[Array, "B T A"] | None, drop: Bool[Array, " B"] | None
+    ) -> Float[Array, "B T 1 C"]:
         """Returns the learned action embeddings c = E_a(a), for all cells of a frame."""
-        cfg = self.config
         if actions is None:
             raise ValueError(f"the model reads actions ({cfg.action_inputs} numbers a frame), and got none")
         if cfg.action_encoder == "mlp":
-            inner = gelu(Dense(cfg.width, name="action_encoder_fc1")(actions))
-            encoded = Dense(cfg.width, kernel_init=nn.initializers.zeros, name="action_encoder_fc2")(inner)
+            inner = gelu(Dense(cfg.width, name=f"{prefix}action_encoder_fc1")(actions))
+            encoded = Dense(cfg.width, kernel_init=nn.initializers.zeros, name=f"{prefix}action_encoder_fc2")(inner)
         else:
-            encoded = Dense(cfg.width, name="action_encoder")(actions)
+            encoded = Dense(cfg.width, name=f"{prefix}action_encoder")(actions)
         if cfg.departures.action_dropout:
-            null = self.param("null_action", nn.initializers.zeros, (cfg.width,))
+            null = self.param(f"{prefix}null_action", nn.initializers.zeros, (cfg.width,))
             encoded = with_null_action(encoded, null, drop)
         return encoded[:, :, None]
 
-    def _head(self, modality: str, x: Float[Array, "B T S C"]) -> Float[Array, "B T S n V"]:
-        cfg = self.config
+    def _head(self, modality: str, x: Float[Array, "B T s c"]) -> Float[Array, "B T S n V"]:
+        cfg = self.config.sizes(modality)
+        coarse = self.config.grid // cfg.grid
         x = optional_norm(cfg.departures.more_norms, f"{modality}_norm_out", x)
         if cfg.public.mup:
             x = x / (cfg.width / MUP_WIDTH)
         bf16 = cfg.compute_dtype == "bfloat16"
-        logits = Dense(cfg.vocabularies * cfg.vocabulary_size, bf16, name=f"{modality}_head")(x)
-        return logits.astype(jnp.float32).reshape(*x.shape[:-1], cfg.vocabularies, cfg.vocabulary_size)
+        logits = Dense(coarse**2 * cfg.vocabularies * cfg.vocabulary_size, bf16, name=f"{modality}_head")(x)
+        if coarse > 1:
+            logits = split(logits, coarse)
+        return logits.astype(jnp.float32).reshape(*logits.shape[:-1], cfg.vocabularies, cfg.vocabulary_size)
 
     def init_params(self, key: Array) -> Params:
         """Returns fresh parameters; blocks are stacked along a leading axis."""
@@ -369,6 +409,9 @@ def _rematerialised(config: Architecture) -> Any:
 
 def empty_cache(config: Architecture, batch: int, frames: int, dtype: Any = jnp.float32) -> StackedCache:
     """Returns a cache of ``frames`` slots for every block and branch: zeros, never read before they are written."""
-    shape = (config.blocks, batch, config.grid**2, config.heads, frames, config.head_width)
-    zeros = jnp.zeros(shape, dtype)
-    return {branch: KeyValues(zeros, zeros) for branch in config.branches}
+    cache = {}
+    for name in (*config.branches, *config.more_rgb):
+        cfg = config.sizes("depth") if name == "depth" else config
+        zeros = jnp.zeros((config.groups, batch, cfg.grid**2, cfg.heads, frames, cfg.head_width), dtype)
+        cache[name] = KeyValues(zeros, zeros)
+    return cache

@@ -108,18 +108,39 @@ def bandwidth(budget: float) -> float:
 
 def operations(arch: Architecture, config: Config, batch: int) -> tuple[Operation, ...]:
     """Returns the operations of a training step's forward pass, without rematerialisation and without embeddings."""
-    width = arch.width
-    hidden = arch.public.mlp_ratio * arch.width
-    heads = arch.heads
     frames = config.clips.frames
-    cells = arch.grid**2
-    blocks = arch.blocks * len(arch.branches)
+    found: dict[str, Operation] = {}
+    for modality in arch.modalities:
+        for each in _branch_operations(arch, modality, frames, batch):
+            name = each.name
+            if not each.times:
+                continue
+            if name in found and found[name].shapes != each.shapes:
+                name = f"{modality}_{name}"
+            times = each.times
+            if name in found:
+                times += found[name].times
+            found[name] = replace(each, name=name, times=times)
+    return tuple(found.values())
+
+
+def _branch_operations(arch: Architecture, modality: str, frames: int, batch: int) -> tuple[Operation, ...]:
+    """Returns the operations of a modality: those of its head, and if it has a branch, of that."""
+    sizes = arch.sizes(modality)
+    width = sizes.width
+    hidden = sizes.public.mlp_ratio * width
+    heads = sizes.heads
+    cells = sizes.grid**2
     rows = batch * frames * cells
     bf16 = arch.compute_dtype == "bfloat16"
+    blocks = sizes.blocks * (modality in arch.branches)
     norms = blocks * (4 if arch.public.qk_norm else 2)
     if arch.departures.more_norms:
-        norms += blocks + len(arch.modalities)
-    joint = arch.blocks if arch.depth == "branch" else 0  # depth → RGB
+        norms += blocks + 1
+    joint = blocks * (modality == "depth")  # depth → RGB
+    coarse = (arch.grid // sizes.grid) ** 2
+    merges = (1 + arch.departures.read_previous) * (coarse > 1)
+    codes = coarse * arch.vocabularies * arch.vocabulary_size
 
     def product(name: str, times: int, inputs: int, outputs: int) -> Operation:
         layer = Dense(outputs, bf16, use_bias=False)
@@ -133,19 +154,24 @@ def operations(arch: Architecture, config: Config, batch: int) -> tuple[Operatio
         shape = (batch, groups, keys, heads, width // heads)
         return Operation(name, blocks, run, (shape,) * 3, 4.0 * rows * keys * width)
 
-    vocabulary = (rows, arch.vocabularies, arch.vocabulary_size)
+    vocabulary = (batch * frames * arch.grid**2, arch.vocabularies, arch.vocabulary_size)
     return (
         product("qkv", 2 * blocks, width, 3 * width),
-        product("projection", 2 * blocks + joint, width, width),
+        product("projection", 2 * blocks, width, width),
+        product("depth_to_rgb", joint, width, arch.width),
         product("mlp_in", blocks, width, hidden),
         product("mlp_out", blocks, hidden, width),
-        product("head", len(arch.modalities), width, arch.vocabularies * arch.vocabulary_size),
+        product("merge", merges, coarse * width, width),
+        product("head", 1, width, codes),
         attention("attention_in_frames", partial(attend_cells, bf16=bf16), frames, cells),
         attention("attention_over_time", partial(_causal, frames), cells, frames),
         Operation("gelu", blocks, gelu, ((rows, hidden),)),
         Operation("norm", norms, norm, ((rows, width), (width,), (width,))),
-        Operation("residual_sum", 3 * blocks + joint, jnp.add, ((rows, width),) * 2, passes_on=True),
-        Operation("loss", len(arch.modalities), _cross_entropy, (vocabulary,)),
+        Operation("residual_sum", 3 * blocks, jnp.add, ((rows, width),) * 2, passes_on=True),
+        Operation(
+            "depth_to_rgb_sum", joint, jnp.add, ((batch * frames * arch.grid**2, arch.width),) * 2, passes_on=True
+        ),
+        Operation("loss", 1, _cross_entropy, (vocabulary,)),
     )
 
 

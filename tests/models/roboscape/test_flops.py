@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from rsjax.config import PublicCodeConfig
+from rsjax.config import Departures, PublicCodeConfig
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.departures.motion_head import MotionHead
 from rsjax.models.roboscape.flops import forward_flops, motion_head_flops
@@ -41,10 +41,13 @@ def xla_flops(function: Any, *inputs: Any) -> float:
     [
         DUAL,
         replace(DUAL, depth="head"),
+        replace(DUAL, depth_width=16, action_encoder="mlp"),
+        replace(DUAL, depth_blocks=1),
+        replace(DUAL, grid=4, depth_width=16, depth_cells=2, departures=Departures(read_previous=True)),
         replace(DUAL, depth="none", action_inputs=0),
         replace(DUAL, public_code=NARROW, vocabularies=1),
     ],
-    ids=["dual", "head", "genie", "other shapes"],
+    ids=["dual", "head", "narrow", "shallow", "coarse", "genie", "other shapes"],
 )
 def test_a_pass_of_the_world_model_is_the_formula_to_the_letter(config: Architecture) -> None:
     logits, params, inputs = world_model(config)

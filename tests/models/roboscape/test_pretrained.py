@@ -66,7 +66,7 @@ def public(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ],
     ids=["plain", "qk-norm and muP", "bfloat16", "MLP of actions"],
 )
-@pytest.mark.parametrize("depth", ["branch", "head"])
+@pytest.mark.parametrize("depth", ["branch", "small branch", "head"])
 def test_a_model_with_depth_begins_with_the_very_logits_of_the_genie_it_starts_from(
     depth: Any, options: dict[str, Any], tmp_path: Path
 ) -> None:
@@ -74,11 +74,16 @@ def test_a_model_with_depth_begins_with_the_very_logits_of_the_genie_it_starts_f
     tensors = random_tensors(genie_shapes(2, 8, 2, 3, 4, 4, "public_code" in options))
     config, params = from_public(Path("file"), tensors, settings)
     save(tmp_path, config, params)
-    alone, dual = replace(config, **options), replace(DUAL, depth=depth, **options)
+    alone, dual = replace(config, **options), replace(DUAL, **options)
+    if depth == "head":
+        dual = replace(dual, depth="head")
+    if depth == "small branch":
+        dual = replace(dual, depth_width=4, depth_blocks=1)
     fresh = random_params(dual, seed=1)
     begun = begin(dual, tmp_path, fresh)
     expected = rgb_logits(alone, params)
-    np.testing.assert_array_equal(rgb_logits(dual, begun), expected)
+    tolerance = 1e-4 * (depth == "small branch")  # its program sums in another order
+    np.testing.assert_allclose(rgb_logits(dual, begun), expected, rtol=tolerance, atol=tolerance)
     assert expected.std() > 0.1
     assert jax.tree.map(jnp.shape, begun) == jax.tree.map(jnp.shape, fresh)
     jax.tree.map(np.testing.assert_array_equal, begun["depth_head"], fresh["depth_head"])

@@ -16,6 +16,7 @@ from rsjax.tokenizers import lfq
 from tests.models.roboscape.toy import depart
 from tests.models.roboscape.toy_sample import BATCH, DUAL, HEAD, KEY, NO_PARAMS, RGB, count_model, given, random_params
 
+SMALL = replace(DUAL, depth_width=8, depth_blocks=1, depth_cells=3)
 WHOLE = depart(DUAL, read_previous=True, whole_frames=True)
 
 
@@ -27,9 +28,10 @@ WHOLE = depart(DUAL, read_previous=True, whole_frames=True)
         (RGB, 3, SampleConfig(steps=2, temperature=1.0)),
         (depart(DUAL, read_previous=True), 1, SampleConfig(steps=2)),
         (WHOLE, 3, SampleConfig(steps=2, temperature=1.0)),
+        (SMALL, 1, SampleConfig(steps=2)),
         (depart(HEAD, read_previous=True), 3, SampleConfig(steps=4, unmask="greedy")),
     ],
-    ids=["dual-random", "dual-greedy", "rgb-warm", "previous", "whole-warm", "head-greedy"],
+    ids=["dual-random", "dual-greedy", "rgb-warm", "previous", "whole-warm", "small", "head-greedy"],
 )
 def test_cached_is_uncached(model: Architecture, prompt: int, sample: SampleConfig) -> None:
     params, (tokens, actions) = random_params(model), given(model, prompt)

@@ -10,14 +10,18 @@ from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.transformer import Transformer, empty_cache
 from tests.models.roboscape.toy import (
     BATCH,
+    COARSE,
     DUAL,
     GENIE,
     GUIDED,
     HEAD,
+    NARROW,
     NORMED,
     QK_NORM,
     READS_PREVIOUS,
     RGB,
+    SHALLOW,
+    SMALL,
     WHOLE,
     apply,
     apply_plain,
@@ -30,6 +34,9 @@ from tests.models.roboscape.toy import (
 
 CONFIGS = {"dual": DUAL, "rgb": RGB, "normed": NORMED, "qk-norm": QK_NORM, "previous": READS_PREVIOUS, "genie": GENIE}
 CONFIGS |= {"whole-frames": WHOLE, "head": HEAD, "head-previous": replace(READS_PREVIOUS, depth="head")}
+SMALLER = {"narrow": NARROW, "shallow": SHALLOW, "coarse": COARSE, "small": SMALL}
+CONFIGS |= SMALLER
+PIECED = {"dual": DUAL, "qk-norm": QK_NORM, "head": HEAD, "small": replace(SMALL, departures=DUAL.departures)}
 
 
 @pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS)
@@ -237,7 +244,11 @@ def test_depth_never_reads_rgb() -> None:
     assert not np.allclose(before["rgb"], after["rgb"])
 
 
-@pytest.mark.parametrize("config", [DUAL, QK_NORM, HEAD], ids=["dual", "qk-norm", "head"])
+@pytest.mark.parametrize(
+    "config",
+    [DUAL, QK_NORM, HEAD, replace(SMALL, departures=DUAL.departures)],
+    ids=["dual", "qk-norm", "head", "small"],
+)
 @pytest.mark.parametrize("pieces", [(1, 1, 1, 1, 1), (2, 3)], ids=str)
 def test_pieces_through_the_cache_are_the_whole(config: Architecture, pieces: tuple[int, ...]) -> None:
     params, (tokens, mask, actions) = random_params(config), random_inputs(config)

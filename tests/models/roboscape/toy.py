@@ -22,10 +22,14 @@ def depart(architecture: Architecture, **departures: Any) -> Architecture:
 DUAL = Architecture(frames=5, grid=2, code_bits=4, action_inputs=3, width=8, blocks=2, heads=2)
 RGB = replace(DUAL, depth="none")
 HEAD = replace(DUAL, depth="head")
+NARROW = replace(DUAL, depth_width=4)
+SHALLOW = replace(DUAL, depth_blocks=1)
+COARSE = replace(DUAL, depth_cells=2)
 NORMED = depart(DUAL, more_norms=True)
 QK_NORM = replace(DUAL, public_code=PublicCodeConfig(qk_norm=True, mup=True))
 READS_PREVIOUS = depart(DUAL, read_previous=True)
 WHOLE = depart(READS_PREVIOUS, whole_frames=True)
+SMALL = replace(READS_PREVIOUS, blocks=4, grid=4, depth_width=4, depth_blocks=2, depth_cells=2)
 GENIE = replace(RGB, action_encoder="none", action_inputs=0)
 GUIDED = depart(DUAL, action_dropout=0.5)
 BATCH = 2
@@ -155,27 +159,60 @@ def plain_forward(config: Architecture, params: Any, inputs: tuple) -> dict[str,
     h = {}
     for name, grid in tokens.items():
         flat = grid.reshape(b, t, -1)
-        x = embed(flat, mask.reshape(b, t, -1), p[f"{name}_embed"], config)
+        x = merge(embed(flat, mask.reshape(b, t, -1), p[f"{name}_embed"], config), name, "embed", p, config)
         if config.departures.read_previous:
             absent = np.broadcast_to((np.arange(t) == 0)[None, :, None], flat.shape)
-            x += embed(np.roll(flat, 1, axis=1), absent, p[f"{name}_previous_embed"], config)
+            before = embed(np.roll(flat, 1, axis=1), absent, p[f"{name}_previous_embed"], config)
+            x += merge(before, name, "previous_embed", p, config)
+        prefix = "depth_" * (name == "depth" and "depth_pos_embed" in p)
         h[name] = x
         if name in config.branches:
-            h[name] = h[name] + p["pos_embed"][:t]
+            h[name] = h[name] + p[f"{prefix}pos_embed"][:t]
         if name in config.branches and config.action_inputs:
-            h[name] += (actions @ p["action_encoder"]["kernel"] + p["action_encoder"]["bias"])[:, :, None]
+            encoder = p[f"{prefix}action_encoder"]
+            h[name] += (actions @ encoder["kernel"] + encoder["bias"])[:, :, None]
     if config.depth == "head":
         h = {"rgb": h["rgb"] + h["depth"]}
     for block in range(config.blocks):
-        own = jax.tree.map(lambda x, block=block: x[block], p["blocks"])
-        h = {name: st_block(x, own[name], config) for name, x in h.items()}
-        if config.depth == "branch":
-            h["rgb"] = h["rgb"] + h["depth"] @ own["depth_to_rgb"]["kernel"] + own["depth_to_rgb"]["bias"]
+        group, place = divmod(block, config.blocks // config.groups)
+        own = jax.tree.map(lambda x, group=group: x[group], p["blocks"])
+        h["rgb"] = st_block(h["rgb"], own["rgb" if place == 0 else f"rgb_{place}"], config)
+        if config.depth == "branch" and place == 0:
+            h["depth"] = st_block(h["depth"], own["depth"], config.sizes("depth"))
+            joining = h["depth"] @ own["depth_to_rgb"]["kernel"] + own["depth_to_rgb"]["bias"]
+            h["rgb"] = h["rgb"] + joining[:, :, coarse_cell(config)]
     if config.depth == "head":
         h["depth"] = h["rgb"]
     if config.departures.more_norms:
         h = {name: layer_norm(x, p[f"{name}_norm_out"]) for name, x in h.items()}
     if config.public.mup:
-        h = {name: x * 256 / config.width for name, x in h.items()}
+        h = {name: x * 256 / x.shape[-1] for name, x in h.items()}
     logits = {name: x @ p[f"{name}_head"]["kernel"] + p[f"{name}_head"]["bias"] for name, x in h.items()}
-    return {name: x.reshape(*x.shape[:3], config.vocabularies, config.vocabulary_size) for name, x in logits.items()}
+    if config.depth_cells > 1:
+        each = logits["depth"].reshape(b, t, -1, config.depth_cells**2, logits["rgb"].shape[-1])
+        logits["depth"] = each[:, :, coarse_cell(config), place_in_coarse_cell(config)]
+    return {name: x.reshape(b, t, -1, config.vocabularies, config.vocabulary_size) for name, x in logits.items()}
+
+
+def coarse_cell(config: Architecture) -> np.ndarray:
+    """Each cell's coarse cell."""
+    n = config.depth_cells
+    return np.array([i // n * (config.grid // n) + j // n for i in range(config.grid) for j in range(config.grid)])
+
+
+def place_in_coarse_cell(config: Architecture) -> np.ndarray:
+    """Each cell's place among those of its coarse cell."""
+    n = config.depth_cells
+    return np.array([i % n * n + j % n for i in range(config.grid) for j in range(config.grid)])
+
+
+def merge(x: np.ndarray, name: str, table: str, p: Any, config: Architecture) -> np.ndarray:
+    """The embeddings of a branch's cells, each of several cells where those of depth are coarser."""
+    if name == "rgb" or config.depth_cells == 1:
+        return x
+    layer = p[f"{name}_{table}_merge"]
+    kernel = layer["kernel"].reshape(config.depth_cells**2, x.shape[-1], -1)
+    out = np.zeros((*x.shape[:2], (config.grid // config.depth_cells) ** 2, x.shape[-1]))
+    for cell, (coarse, place) in enumerate(zip(coarse_cell(config), place_in_coarse_cell(config), strict=True)):
+        out[:, :, coarse] += x[:, :, cell] @ kernel[place]
+    return out + layer["bias"]

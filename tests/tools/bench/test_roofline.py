@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from rsjax.config import ConfigError, TokenizerConfig, presets
+from rsjax.config import ConfigError, SmallDepthBranch, TokenizerConfig, presets
 from rsjax.config.config_fields import with_values
 from rsjax.layers.cpu import convolution
 from rsjax.models.base import create_model
@@ -21,7 +21,13 @@ from tests.models.toy_family import ToyConfig
 
 @pytest.mark.parametrize(
     ("name", "changes"),
-    [("tiny", {}), ("tiny", {"model.depth": "head"}), ("genie_35m", {}), ("roboscape_s", {})],
+    [
+        ("tiny", {}),
+        ("tiny", {"model.depth": "head"}),
+        ("tiny", {"model.depth": SmallDepthBranch(width=64, blocks=2, cells=2)}),
+        ("genie_35m", {}),
+        ("roboscape_s", {}),
+    ],
 )
 def test_their_products_are_all_that_the_model_counts(name: str, changes: dict[str, Any]) -> None:
     config = with_values(presets.get(name), changes)
@@ -53,7 +59,15 @@ def test_the_tokenizers_products_are_all_that_it_counts(
             assert ("scan" in str(program)) == (wide and config.compute_dtype == "bfloat16")
 
 
-@pytest.mark.parametrize("changes", [{}, {"depth": "head"}, {"depth": "none", "departures.rotary": True}])
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"depth": "head"},
+        {"depth": SmallDepthBranch(width=16, blocks=1)},
+        {"depth": "none", "departures.rotary": True},
+    ],
+)
 def test_a_cached_passs_products_are_all_that_the_model_counts(changes: dict[str, Any]) -> None:
     config = with_values(presets.debug(), {f"model.{name}": value for name, value in changes.items()})
     model = create_model(config)

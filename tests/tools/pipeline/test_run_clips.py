@@ -208,7 +208,7 @@ def test_real_episodes_from_recording_to_video(tmp_path: Path) -> None:
     few = ["--tokenizer-train.steps", 2, "--train.steps", 2, "--model.sample.steps", 2]
     few += ["--eval.clips", 2, "--eval.batch-size", 2, "--eval.action-draws", 1]
     told = commanded(tmp_path, "train", "debug", "--store", store, "--run-dir", run, *few)
-    assert "no clip has depth, so the depth branch trains with its loss masked" in told
+    assert "no clip has depth, so depth trains with its loss masked" in told
     log = [json.loads(line) for line in (run / "world_model" / "log.jsonl").read_text().splitlines()]
     trained = [row for row in log if "loss" in row]
     assert trained and all(row["depth"] == 0 and np.isfinite(row["loss"]) for row in trained)

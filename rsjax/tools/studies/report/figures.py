@@ -34,7 +34,7 @@ class ClipFigure:
         reconstruction: the truth, encoded and decoded by the tokenizer: an upper bound on any prediction's quality.
         other_actions: frames generated from the same prompt and another clip's actions.
         true_depth: metres, or relative; 0 or NaN where there is none.
-        predicted_depth: the depth branch's, in the same unit.
+        predicted_depth: the model's, in the same unit.
         depth_unit: "metres" or "relative".
         tracks: keypoints, x and y in 0–1 as in :class:`rsjax.clip.Clip`.
         visible: as in :class:`rsjax.clip.Clip`.

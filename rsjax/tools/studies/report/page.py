@@ -31,10 +31,10 @@ _PLACE_ROWS = tuple(PLACE_SCENES.items())
 _PLACE_ERRORS = ("cube_error_widths", "gripper_error_widths")
 _PLACES = (*_PLACE_ERRORS, "lifted_accuracy")  # metrics in a table of their own
 _DEPTH_ROWS = (
-    ("", "depth branch, in metres"),
-    ("_median_branch", "depth branch, median scale"),
-    ("_affine_disparity_branch", "depth branch, scale and shift of 1/depth"),
-    ("_l1_scale_branch", "depth branch, L1 scale"),
+    ("", "predicted depth, in metres"),
+    ("_median_branch", "predicted depth, median scale"),
+    ("_affine_disparity_branch", "predicted depth, scale and shift of 1/depth"),
+    ("_l1_scale_branch", "predicted depth, L1 scale"),
     ("_median_estimator", "estimator, median scale"),
     ("_affine_disparity_estimator", "estimator, scale and shift of 1/depth"),
     ("_l1_scale_estimator", "estimator, L1 scale"),

@@ -54,7 +54,7 @@ def judge(metrics: Mapping[str, float]) -> list[Verdict]:
         try:
             measured = float(target.measure(metrics))
         except KeyError:
-            continue  # not measured: a model without a depth branch, for example
+            continue  # not measured: a model without depth, for example
         margin = measured - target.bound if target.at_least else target.bound - measured
         verdicts.append(Verdict(target, measured, margin))
     return verdicts

@@ -138,7 +138,7 @@ def test_an_absent_metric_has_its_reason_as_a_footnote(tmp_path):
     write_report(tmp_path / "r.html", report)
     page = _Page(tmp_path / "r.html")
     assert ["prediction", "26.31", "25.40 – 27.20", "0.871", "–¹", "0.0213", "–²", "–¹", "6.75"] in page.cells
-    assert ["depth branch, median scale", "0.0123", "–²"] in page.cells
+    assert ["predicted depth, median scale", "0.0123", "–²"] in page.cells
     assert ["estimator, median scale", "–¹", "–²"] in page.cells
     assert "¹ no <weights>." in page.text and "² no depth." in page.text
 
