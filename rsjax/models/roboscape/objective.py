@@ -136,12 +136,13 @@ def other_keypoint_term(
 ) -> Term:
     """Returns a keypoint term that the paper does not have, as its file in ``departures/`` defines it.
 
-    A point counts only where it is visible.
+    It is a mean over T_sample. A point counts only where it is visible, in M_i too.
     """
     bits = architecture.code_bits
     grid = architecture.grid
-    cells = token_cells(batch.tracks, grid).swapaxes(1, 2)  # B T N
-    visible = batch.visible.swapaxes(1, 2)
+    count = min(config.loss.num_keypoints, batch.tracks.shape[1])
+    points, visible = (x.swapaxes(1, 2) for x in most_active(batch.tracks, batch.visible, count))
+    cells = token_cells(points, grid)  # B T K
     if config.keypoint_term == "difference":
         s_hat = lfq.mean_codes(logits, bits)
         s = lfq.tokens_to_codes(batch.rgb, bits).reshape(s_hat.shape)
@@ -150,14 +151,12 @@ def other_keypoint_term(
         counts = visible[:, 1:] & visible[:, :-1]
     elif config.keypoint_term == "motion":
         assert motion is not None
-        errors = bits * motion_error(motion, grid * batch.tracks.swapaxes(1, 2), visible, cells)
+        errors = bits * motion_error(motion, grid * points, visible, cells)
         counts = visible[:, :-1]
     else:
         assert trunk is not None
-        most = min(config.loss.num_keypoints, batch.tracks.shape[1])
-        moving = select(batch.tracks, batch.visible, most, grid)
-        errors = bits * feature_distance(trunk, moving.cells.swapaxes(1, 2))
-        counts = (moving.visible[..., 1:] & moving.visible[..., :1]).swapaxes(1, 2)
+        errors = bits * feature_distance(trunk, cells)
+        counts = visible[:, 1:] & visible[:, :1]
     counts = counts * batch.weight[:, None, None]
     return jnp.sum(errors * counts), jnp.sum(counts)
 
@@ -196,9 +195,17 @@ def select(tracks: Float[Array, "B N T 2"], visible: Bool[Array, "B N T"], count
     Args:
         visible: the frames in which each point counts.
     """
+    moving, counted = most_active(tracks, visible, count)
+    return Keypoints(token_cells(moving, grid), counted)
+
+
+def most_active(
+    tracks: Float[Array, "B N T 2"], visible: Bool[Array, "B N T"], count: int
+) -> tuple[Float[Array, "B K T 2"], Bool[Array, "B K T"]]:
+    """Returns the ``count`` tracks of the largest M_i, and the frames in which each of them counts."""
     _, chosen = jax.lax.top_k(motion_magnitude(tracks, visible), count)
     take = jax.vmap(lambda values, indices: values[indices])
-    return Keypoints(token_cells(take(tracks, chosen), grid), take(visible, chosen))
+    return take(tracks, chosen), take(visible, chosen)
 
 
 def attention_map(keypoints: Keypoints, grid: int, gamma: float) -> Float[Array, "B T H W"]:

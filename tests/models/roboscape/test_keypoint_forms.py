@@ -183,12 +183,16 @@ def test_a_hidden_point_does_not_count(keypoints: str) -> None:
     assert terms(keypoints, visible=VISIBLE & False)["keypoint"] == (0, 0)
 
 
-@pytest.mark.parametrize("keypoints", ["difference", "motion"])
-def test_all_tracks_count_whatever_k(keypoints: str) -> None:
-    few = terms(keypoints, num_keypoints=1)
-    many = terms(keypoints, num_keypoints=TRACKS)
-    np.testing.assert_array_equal(few["keypoint"], many["keypoint"])
-    assert few["attention"] != many["attention"]
+@pytest.mark.parametrize("keypoints", ["difference", "motion", "feature"])
+def test_the_tracks_that_move_most_count_alone(keypoints: str) -> None:
+    k = 2
+    steps = np.linalg.norm(np.diff(TRACKED, axis=2), axis=-1) * (VISIBLE[..., 1:] & VISIBLE[..., :-1])
+    most = np.argsort(-steps.sum(-1), axis=1, kind="stable")[:, :k, None]
+    tracks = np.take_along_axis(TRACKED, most[..., None], axis=1)
+    visible = np.take_along_axis(VISIBLE, most, axis=1)
+    expected = terms(keypoints, tracks=tracks, visible=visible)["keypoint"]
+    np.testing.assert_allclose(terms(keypoints, num_keypoints=k)["keypoint"], expected, rtol=1e-5)
+    assert terms(keypoints)["keypoint"][1] > expected[1]
 
 
 def test_normalised_attention_is_a_cross_entropy_whose_weights_have_the_mean_1() -> None:
