@@ -80,8 +80,8 @@ def figures(config: Config, modules: dict[str, Shapes]) -> dict[str, int]:
       cache. Training: those of three forward passes, without what remat repeats.
     - ``bytes_train_state``: of the world model's parameters, optimizer state, averages and gradients, per device.
     - ``bytes_activations_per_clip``: what automatic differentiation keeps of forward pass and loss; the compiler may
-      keep less. ``…_remat``: each block's input, and everything of the block that is being recomputed. The first is for
-      ``model.remat`` "none", the second for "blocks"; "products" is between them.
+      keep less. ``…_remat``: each block's inputs, a depth block's output, and everything of the block that is being
+      recomputed. The first is for ``model.remat`` "none", the second for "blocks"; "products" is between them.
     - ``bytes_cache_…``: keys and values that one rollout of a clip's length keeps, for a family with a cache.
     """
     model = create_model(config)

@@ -103,9 +103,9 @@ def test_activations_are_what_another_clip_adds_to_what_the_backward_pass_holds(
     assert activation_bytes(DEBUG)[False] == kept_for(3) - kept_for(2)
 
 
-def test_with_remat_another_block_adds_its_input_alone() -> None:
+def test_with_remat_another_block_adds_its_inputs_and_depth_s_output_alone() -> None:
     one, two, three = (activation_bytes(with_blocks(n)) for n in (1, 2, 3))
-    of_features = 2 * NETWORK.frames * NETWORK.grid**2 * NETWORK.width * 4
+    of_features = 3 * NETWORK.frames * NETWORK.grid**2 * NETWORK.width * 4
     assert three[True] - two[True] == two[True] - one[True] == of_features
     assert three[False] - two[False] == two[False] - one[False] > 10 * of_features
 

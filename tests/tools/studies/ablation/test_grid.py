@@ -121,7 +121,7 @@ def test_a_value_as_printed_is_read_back() -> None:
     ("name", "text", "line"),
     [
         ("tokenizer.local_codes", "Tru", "is 'Tru' in the grid; did you mean 'True'? (choices: True, False)"),
-        ("model.depth", "heads", "is 'heads' in the grid; did you mean 'head'? (choices: branch, head, none)"),
+        ("model.depth", "heads", "is 'heads' in the grid; did you mean 'head'? (choices: branch, small_branch, head"),
         ("model.sample.unmask", "greed", "did you mean 'greedy'? (choices: random, greedy)"),
         ("model.loss.gamma", "five", "model.loss.gamma is 'five' in the grid; it takes a number"),
         ("model.loss.gamma", "nan", "it takes a number"),
