@@ -292,7 +292,7 @@ def test_weights_of_metrics_that_come_later_train_nothing_again(tmp_path: Path, 
     """But the marks of the runs that are there must have the same content keys."""
     first, later = (
         make_plan([toy.claim()], Scale(HOUR, with_values(presets.debug(), {"eval.weights": file})), Path("data"), 1)
-        for file in ("", "weights")
+        for file in ("", "elsewhere")
     )
     assert not first.cells.keys() & later.cells.keys()
     run(first, tmp_path)
