@@ -7,14 +7,13 @@ import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float
 
-from rsjax.layers.gpu.norm import Norm
+from rsjax.layers.parameters import EPSILON, Norm
 from rsjax.layers.platform import linear, norm_linear
 
-# torch's default for linear layers, U(±1/√fan_in), as in the public code.
 Params: TypeAlias = dict[str, Any]  # a tree of arrays
 
+# torch's default for linear layers, U(±1/√fan_in), as in the public code.
 TORCH_KERNEL = nn.initializers.variance_scaling(1 / 3, "fan_in", "uniform")
-EPSILON = 1e-5  # of LayerNorm, as in torch
 PRODUCT = "product"  # the name of linear layers' outputs in rematerialisation policies
 
 

@@ -5,8 +5,7 @@ from jaxtyping import Array, Float
 from rsjax.layers import platform
 from rsjax.layers.dense import dense, normalised
 from rsjax.layers.gelu import gelu
-from rsjax.layers.gpu.mlp import Linear
-from rsjax.layers.gpu.norm import Norm
+from rsjax.layers.parameters import Linear, Norm
 
 
 def mlp(x: Float[Array, "B T S C"], norm: Norm | None, fc1: Linear, fc2: Linear, bf16: bool) -> Float[Array, "B T S C"]:

@@ -24,7 +24,7 @@ from rsjax.layers.gpu import cached_attention as gpu_cached
 from rsjax.layers.gpu import feed_forward as gpu_feed_forward
 from rsjax.layers.gpu import mlp as gpu_mlp
 from rsjax.layers.gpu import norm_linear as gpu_norm_linear
-from rsjax.layers.gpu.norm import Norm
+from rsjax.layers.parameters import Linear, Norm
 from rsjax.layers.partition import devices_are_known
 from rsjax.layers.tpu import attention as tpu
 
@@ -34,9 +34,9 @@ def by_platform(cpu: Callable[..., Any], accelerator: Callable[..., Any], *opera
     return jax.lax.platform_dependent(*operands, cpu=cpu, default=accelerator)
 
 
-def on_gpu(gpu: Callable[[], Any], other: Callable[[], Any]) -> Any:
-    """Returns ``gpu()`` in a program for an NVIDIA GPU and ``other()`` in one for other platforms."""
-    return jax.lax.platform_dependent(cuda=gpu, default=other)
+def where_launches_take_long(few: Callable[[], Any], other: Callable[[], Any]) -> Any:
+    """Returns ``few()`` in a program for an NVIDIA GPU, where small kernels take less than their launches."""
+    return jax.lax.platform_dependent(cuda=few, default=other)
 
 
 def in_feature_dtype(dtype: str, run: Callable[[str], Any]) -> Any:
@@ -92,8 +92,8 @@ def attend_over_cache(
 def mlp(
     x: Float[Array, "B T S C"],
     norm: Norm | None,
-    fc1: gpu_mlp.Linear,
-    fc2: gpu_mlp.Linear,
+    fc1: Linear,
+    fc2: Linear,
     layers: Callable[..., Float[Array, "B T S C"]],
 ) -> Float[Array, "B T S C"]:
     """Returns ``layers(x, norm, fc1, fc2)``, x + fc2(gelu(fc1(norm(x)))).
@@ -107,8 +107,8 @@ def mlp(
 
 def feed_forward(
     x: Float[Array, "B T S C"],
-    fc1: gpu_mlp.Linear,
-    fc2: gpu_mlp.Linear,
+    fc1: Linear,
+    fc2: Linear,
     layers: Callable[..., Float[Array, "B T S C"]],
 ) -> Float[Array, "B T S C"]:
     """Returns ``layers(x, fc1, fc2)``, fc2(gelu(fc1(x))).

@@ -20,9 +20,8 @@ from jaxtyping import Array, Float
 
 from rsjax.layers.gpu.gelu import gelu
 from rsjax.layers.packed_attention import product
+from rsjax.layers.parameters import Linear
 from rsjax.layers.partition import each_own_clips
-
-Linear = tuple[Float[Array, "M N"], Float[Array, " N"]]  # kernel and bias
 
 ROWS = 128  # of a tile
 FEATURES = 128  # of a tile

@@ -19,11 +19,10 @@ from jax.experimental.pallas import triton
 from jaxtyping import Array, Float
 
 from rsjax.layers.gpu.gelu import gelu
-from rsjax.layers.gpu.norm import Norm, layer_norm, whiten
+from rsjax.layers.gpu.norm import layer_norm, whiten
 from rsjax.layers.packed_attention import product
+from rsjax.layers.parameters import Linear, Norm
 from rsjax.layers.partition import each_own_clips
-
-Linear = tuple[Float[Array, "M N"], Float[Array, " N"]]  # kernel and bias
 
 # Tiles for the shared memory of every card: an RTX 4090 has 99 KB, less than half of an H100's.
 ROWS = 64  # of a tile

@@ -9,9 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-Norm = tuple[Float[Array, " C"], Float[Array, " C"]]  # scale and bias
-
-EPSILON = 1e-5  # torch's
+from rsjax.layers.parameters import EPSILON
 
 
 def layer_norm(x: Float[Array, "R C"], norm: Any) -> Float[Array, "R C"]:

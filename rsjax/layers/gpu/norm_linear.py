@@ -15,8 +15,9 @@ from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton
 from jaxtyping import Array, Float
 
-from rsjax.layers.gpu.norm import Norm, layer_norm
+from rsjax.layers.gpu.norm import layer_norm
 from rsjax.layers.packed_attention import product
+from rsjax.layers.parameters import Norm
 from rsjax.layers.partition import each_own_clips
 
 # Tiles for the shared memory of every card: an RTX 4090 has 99 KB.

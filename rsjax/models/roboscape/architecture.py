@@ -33,7 +33,7 @@ class Architecture(TransformerConfig):
         motion_head: whether training predicts how tracked points move
             (:mod:`rsjax.models.roboscape.departures.motion_head`).
         feature_dtype: of the features between layers; :func:`rsjax.models.roboscape.transformer.run_transformer` sets
-            it, and :func:`rsjax.models.roboscape.sample.for_gpu`.
+            it, and :func:`rsjax.models.roboscape.sample.written_out`.
     """
 
     frames: int = 16

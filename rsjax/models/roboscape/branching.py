@@ -25,7 +25,7 @@ from rsjax.devices import on_cpu
 from rsjax.models.branch_states import BranchState, Decoding
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.departures import mean_codes
-from rsjax.models.roboscape.sample import State, on_each_platform, start, step
+from rsjax.models.roboscape.sample import State, start, step, with_few_launches
 from rsjax.models.roboscape.transformer import Cache
 from rsjax.tokenizers.codec import Codec
 from rsjax.tokenizers.magvit2 import run_tokenizer
@@ -220,7 +220,7 @@ def _advance(
         guidance=guidance[:, None],
         entropy=jnp.zeros((len(states), 1, arch.grid**2)),
     )
-    stacked, frame = on_each_platform(arch, lambda arch: step(arch, sample, params, stacked, actions[:, None]))
+    stacked, frame = with_few_launches(arch, lambda arch: step(arch, sample, params, stacked, actions[:, None]))
     grid = frame["rgb"].reshape(len(states), arch.grid, arch.grid, *frame["rgb"].shape[3:])
     pixels: Any = run_tokenizer(tokenizer, tokenizer_params, grid, "decode")
     kept = replace(stacked, cache={}, key=None, temperature=None, guidance=None)

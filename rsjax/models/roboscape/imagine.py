@@ -16,7 +16,7 @@ from rsjax.config import SampleConfig, TokenizerConfig, TokenModelConfig
 from rsjax.data.depth_color import color_to_depth
 from rsjax.data.normalization import Normalization, with_sums
 from rsjax.models.roboscape.architecture import Architecture
-from rsjax.models.roboscape.sample import CLIPS, State, on_each_platform, start, step, where
+from rsjax.models.roboscape.sample import CLIPS, State, start, step, where, with_few_launches
 from rsjax.tokenizers.codec import Codec
 from rsjax.tokenizers.magvit2 import run_tokenizer
 from rsjax.trainable import Params
@@ -117,7 +117,7 @@ def _step(
     actions: Float[Array, "B A"],
 ) -> tuple[State, Array, Array | None]:
     """Returns the state after the next frame, and the frame: uint8, and metres if ``normalization`` is given."""
-    state, frame = on_each_platform(arch, lambda arch: step(arch, sample, params, state, actions[:, None]))
+    state, frame = with_few_launches(arch, lambda arch: step(arch, sample, params, state, actions[:, None]))
 
     def pixels(branch: str) -> Array:
         grid = frame[branch].reshape(len(actions), arch.grid, arch.grid, *frame[branch].shape[3:])

@@ -91,21 +91,20 @@ class RoboScape(WorldModel[Batch]):
         mask = hidden(departures, corrupted.mask)
         no_depth = None if batch.has_depth is None else batch.has_depth == 0
         drop = dropped_actions(departures.action_dropout, key, batch.index)
-        network = partial(run_transformer, arch, drop_actions=drop, no_depth=no_depth)
-        network_and_trunk = partial(run_with_trunk, arch, drop_actions=drop, no_depth=no_depth)
+        options = {"drop_actions": drop, "no_depth": no_depth}
         inputs = (corrupted.tokens, mask, batch.actions)
         previous = None
         if departures.self_conditioning:
             fixed = jax.lax.stop_gradient(params)
             on = conditions_itself(departures, key, context.step)
-            first_pass = partial(network, fixed, *inputs)
+            first_pass = partial(run_transformer, arch, fixed, *inputs, **options)
             previous = previous_frames(first_pass, corrupted.tokens, arch.code_bits, on, self.prompt_frames)
         trunk = None
         motion: Any = None
         if self.config.keypoint_term in ("motion", "feature"):
-            logits, trunk = network_and_trunk(params, *inputs, previous=previous)
+            logits, trunk = run_with_trunk(arch, params, *inputs, previous=previous, **options)
         else:
-            logits, _ = network(params, *inputs, previous=previous)
+            logits, _ = run_transformer(arch, params, *inputs, previous=previous, **options)
         if arch.motion_head:
             motion = MotionHead().apply({"params": params["motion_head"]}, trunk)
         terms = objective.loss_terms(self.config, arch, logits, targets, mask, batch, trunk, motion)

@@ -18,9 +18,7 @@ from jaxtyping import Array, Bool, Float, Int, Int32
 from rsjax import clip
 from rsjax.config import RoboScapeConfig, TokenModelConfig
 from rsjax.models.roboscape.architecture import Architecture
-from rsjax.models.roboscape.departures.keypoint_difference import difference
-from rsjax.models.roboscape.departures.keypoint_features import feature_distance
-from rsjax.models.roboscape.departures.motion_head import motion_error
+from rsjax.models.roboscape.departures.keypoint_terms import other_keypoint_term
 from rsjax.models.roboscape.departures.normalised_attention import normalised
 from rsjax.models.roboscape.departures.observed_anchor import anchor
 from rsjax.models.roboscape.departures.visible_keypoints import counted_frames
@@ -113,7 +111,9 @@ def loss_terms(
             counts = keypoints.visible.swapaxes(1, 2)[:, 1:] * batch.weight[:, None, None]
             terms["keypoint"] = jnp.sum(distance * counts), jnp.sum(counts)
         elif config.keypoint_term != "none":
-            terms["keypoint"] = other_keypoint_term(config, architecture, logits["rgb"], trunk, motion, batch)
+            points, visible = (x.swapaxes(1, 2) for x in most_active(batch.tracks, batch.visible, count))
+            sample = (grid * points, token_cells(points, grid), visible, batch.weight)
+            terms["keypoint"] = other_keypoint_term(config, bits, logits["rgb"], targets["rgb"], *sample, trunk, motion)
 
         # Eq. 6 and 7: L_Attention = -Σ_t A_t ⊙ s_t log p(ŝ_t). It is divided by the number of cells, not by Σ A.
         attention = attention_map(keypoints, grid, config.loss.gamma)
@@ -124,41 +124,6 @@ def loss_terms(
 
     weights = config.loss_weights
     return {name: term for name, term in terms.items() if name in weights}
-
-
-def other_keypoint_term(
-    config: RoboScapeConfig,
-    architecture: Architecture,
-    logits: Float[Array, "B T S n V"],
-    trunk: Float[Array, "B T S C"] | None,
-    motion: Float[Array, "B T S 3"] | None,
-    batch: Batch,
-) -> Term:
-    """Returns a keypoint term that the paper does not have, as its file in ``departures/`` defines it.
-
-    It is a mean over T_sample. A point counts only where it is visible, in M_i too.
-    """
-    bits = architecture.code_bits
-    grid = architecture.grid
-    count = min(config.loss.num_keypoints, batch.tracks.shape[1])
-    points, visible = (x.swapaxes(1, 2) for x in most_active(batch.tracks, batch.visible, count))
-    cells = token_cells(points, grid)  # B T K
-    if config.keypoint_term == "difference":
-        s_hat = lfq.mean_codes(logits, bits)
-        s = lfq.tokens_to_codes(batch.rgb, bits).reshape(s_hat.shape)
-        first = anchor(config.departures, s_hat, batch.rgb)
-        errors = difference(jnp.concatenate([first, s_hat[:, 1:]], axis=1), s, cells)
-        counts = visible[:, 1:] & visible[:, :-1]
-    elif config.keypoint_term == "motion":
-        assert motion is not None
-        errors = bits * motion_error(motion, grid * points, visible, cells)
-        counts = visible[:, :-1]
-    else:
-        assert trunk is not None
-        errors = bits * feature_distance(trunk, cells)
-        counts = visible[:, 1:] & visible[:, :1]
-    counts = counts * batch.weight[:, None, None]
-    return jnp.sum(errors * counts), jnp.sum(counts)
 
 
 def keypoint_distance(

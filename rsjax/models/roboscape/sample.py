@@ -27,7 +27,7 @@ from jaxtyping import Bool, Float, Int, Key
 from rsjax.clip import Array
 from rsjax.config import SampleConfig
 from rsjax.layers.dense import rounded
-from rsjax.layers.platform import on_gpu
+from rsjax.layers.platform import where_launches_take_long
 from rsjax.layers.unstacked_params import apart, together
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.departures import guidance, mean_codes
@@ -504,7 +504,7 @@ def _rollout(
 ) -> Decoded:
     past = tokens["rgb"].shape[1]
     state = start(arch, sample, params, tokens, actions[:, :past], keys, no_depth)
-    return on_each_platform(arch, partial(_repeat_step, sample, params, tokens, state, actions[:, past:], frames))
+    return with_few_launches(arch, partial(_repeat_step, sample, params, tokens, state, actions[:, past:], frames))
 
 
 @partial(jax.jit, static_argnums=(0, 1))
@@ -540,7 +540,7 @@ def _continue(
         key=keys,
         no_depth=None if state.no_depth is None else repeated(state.no_depth),
     )
-    return on_each_platform(arch, partial(_repeat_step, sample, params, tokens, state, actions, frames))
+    return with_few_launches(arch, partial(_repeat_step, sample, params, tokens, state, actions, frames))
 
 
 def _repeat_step(
@@ -621,23 +621,20 @@ def _recomputed(
     return _grids(arch, means or tokens, no_depth)
 
 
-def on_each_platform(arch: Architecture, run: Callable[[Architecture], Any]) -> Any:
-    """Returns ``run(arch)``; in a program for a GPU, :func:`for_gpu` of it if products are bf16."""
-    written_out = for_gpu(arch)
-    if written_out == arch:
+def with_few_launches(arch: Architecture, run: Callable[[Architecture], Any]) -> Any:
+    """Returns ``run(arch)``; if products are bf16, of :func:`written_out` where launches take long."""
+    if arch.compute_dtype != "bfloat16":
         return run(arch)
-    return on_gpu(partial(run, written_out), partial(run, arch))
+    return where_launches_take_long(partial(run, written_out(arch)), partial(run, arch))
 
 
-def for_gpu(arch: Architecture) -> Architecture:
-    """Returns the settings of a generating program for a GPU: all blocks are written out, not scanned over.
+def written_out(arch: Architecture) -> Architecture:
+    """Returns the settings of a generating program whose blocks are all written out, not scanned over.
 
     A scan would copy each block's parameters and cache out of their stacks in every pass. For few clips these kernels
     would take longer, by their launches alone, than all others.
     """
-    if arch.compute_dtype != "bfloat16":
-        return arch
-    return replace(arch, unroll=arch.blocks, feature_dtype="bfloat16")
+    return replace(arch, unroll=arch.groups, feature_dtype="bfloat16")
 
 
 def for_many_passes(arch: Architecture, params: Params) -> Params:

@@ -20,8 +20,8 @@ from jaxtyping import Array, Bool, Float, Int
 from rsjax.layers.attention import KeyValues, attend, packed, put_frames, sees, unpacked
 from rsjax.layers.dense import PRODUCT, Dense, NormParameters, layer_norm
 from rsjax.layers.gelu import gelu
-from rsjax.layers.gpu.norm import Norm
 from rsjax.layers.mlp import mlp
+from rsjax.layers.parameters import Norm
 from rsjax.layers.partition import gathers
 from rsjax.layers.platform import attend_in_clip, attend_over_cache, in_feature_dtype
 from rsjax.layers.unstacked_params import together

@@ -16,7 +16,7 @@ from rsjax.layers.unstacked_params import apart
 from rsjax.models.base import create_autoencoder, create_model
 from rsjax.models.roboscape.departures import guidance
 from rsjax.models.roboscape.model import RoboScape
-from rsjax.models.roboscape.sample import for_gpu, for_many_passes, start, step
+from rsjax.models.roboscape.sample import for_many_passes, start, step, written_out
 from rsjax.tokenizers.codec import PIXELS
 from rsjax.tokenizers.magvit2 import run_tokenizer
 from rsjax.tools.bench import inputs
@@ -162,8 +162,8 @@ def frame(config: Config, device: Any, clips: int) -> Program:
             f"--part sample compiles the frames of the families roboscape and genie; this is {config.model.family!r}"
         )
     arch = model.architecture
-    if device.platform == "gpu":
-        arch = for_gpu(arch)
+    if device.platform == "gpu" and arch.compute_dtype == "bfloat16":
+        arch = written_out(arch)
     sample = dataclasses.replace(model.config.sample, seed=0)
 
     def first(params: Any) -> Any:
