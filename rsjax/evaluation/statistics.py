@@ -287,7 +287,11 @@ def wilson(successes: int, trials: int, level: float = 0.95) -> Estimate:
     """
     if not 0 <= successes <= trials or not trials:
         raise ValueError(f"{successes} successes of {trials} trials have no share")
-    share = successes / trials
+    return score_interval(successes / trials, trials, level)
+
+
+def score_interval(share: float, trials: float, level: float = 0.95) -> Estimate:
+    """Returns a share with Wilson's score interval for a number of trials, which need not be whole."""
     z = float(ndtri((1 + level) / 2))
     centre = share + z**2 / (2 * trials)
     scale = 1 + z**2 / trials
