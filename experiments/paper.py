@@ -2,7 +2,7 @@
 
 import shlex
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -25,6 +25,8 @@ class Options:
 
     budget: str = "3h"
     """Time that everything may take, on 2 CPU cores: 30min, 3h, 12h, 1h30min …"""
+    size: str = ""
+    """The budget that determines how large the trainings are, if another: --budget 12h --size 3h runs more of them."""
     only: tuple[str, ...] = ()
     """Claims to test, by name or shell pattern (table1, departure-*), which share the budget. Default: all."""
     dir: Path = Path("runs/paper")
@@ -67,7 +69,8 @@ def main() -> None:
     vary = options.vary
     if vary == "auto":
         vary = "everything" if seconds >= VARY_EVERYTHING else "model"
-    plan = make_plan(wanted, scale(preset, seconds), options.data_dir, options.seeds, vary)
+    sizes = scale(preset, parse_duration(options.size or options.budget))
+    plan = make_plan(wanted, replace(sizes, seconds=seconds), options.data_dir, options.seeds, vary)
     command = shlex.join([*PROG.split(), *sys.argv[1:]])
     run.print_plan(plan, options.dir, options.data_dir)
     if options.dry_run:

@@ -10,6 +10,7 @@ from rsjax.config import (
     ConfigError,
     CurriculumStageConfig,
     Departures,
+    DepthHead,
     EvalConfig,
     GenieConfig,
     LossConfig,
@@ -162,6 +163,20 @@ def roboscape_l() -> Config:
     return _full_size("roboscape_l", RoboScapeConfig(width=1024, heads=16))
 
 
+def _physics(name: str, config: Config) -> Config:
+    """Returns a preset with depth as a second head and without keypoint terms, which docs/results/depth.md measures.
+
+    A step costs 1.005 times that of the same network without depth; the paper's branch costs 2.06 times as much.
+    """
+    model = config.model
+    assert isinstance(model, RoboScapeConfig)
+    return replace(
+        config,
+        name=name,
+        model=replace(model, depth=DepthHead(), loss=replace(model.loss, keypoints="none")),
+    )
+
+
 def genie_35m() -> Config:
     """Returns the public Genie (1xgpt's GENIE_35M): RGB only, no actions, half of the frames as prompt."""
     return replace(_full_size("genie_35m", GenieConfig(action_encoder="none")), prompt_frames=8)
@@ -246,6 +261,10 @@ PRESETS = collect(
     roboscape_s(),
     roboscape_m(),
     roboscape_l(),
+    _physics("roboscape_physics_tiny", tiny()),
+    _physics("roboscape_physics_s", roboscape_s()),
+    _physics("roboscape_physics_m", roboscape_m()),
+    _physics("roboscape_physics_l", roboscape_l()),
     genie_35m(),
     genie_138m(),
     genie_35m_actions(),

@@ -1,9 +1,11 @@
 """The named experiments are the sizes that they claim to be."""
 
+from dataclasses import replace
+
 import jax
 import pytest
 
-from rsjax.config import GenieConfig, RoboScapeConfig, presets
+from rsjax.config import DepthHead, GenieConfig, RoboScapeConfig, presets
 from rsjax.models.base import create_model
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.tools.describe import by_part, count
@@ -15,6 +17,9 @@ WORLD_MODELS = {  # (RGB branch with what it shares, all)
     "roboscape_s": (35_226_112, 71_501_568),
     "roboscape_m": (137_560_064, 281_413_120),
     "roboscape_l": (543_554_560, 1_116_472_320),
+    "roboscape_physics_s": (35_226_112, 35_751_680),
+    "roboscape_physics_m": (137_560_064, 138_610_176),
+    "roboscape_physics_l": (543_554_560, 545_653_760),
 }
 
 
@@ -36,11 +41,22 @@ def test_full_size_presets_are_the_papers_setting(name: str) -> None:
     network = Architecture.create(config)
     assert (config.clips.image_size, network.grid, network.code_bits) == (256, 16, 18)
     assert (network.frames, network.blocks) == (16, 32)
-    dual = name.startswith("roboscape")
-    assert isinstance(config.model, RoboScapeConfig if dual else GenieConfig)
-    assert network.depth == ("branch" if dual else "none")
-    assert config.model.uses_depth == dual
-    assert (network.action_inputs > 0) == (dual or name.endswith("actions"))
+    roboscape = name.startswith("roboscape")
+    assert isinstance(config.model, RoboScapeConfig if roboscape else GenieConfig)
+    assert config.model.uses_depth == roboscape
+    assert (network.action_inputs > 0) == (roboscape or name.endswith("actions"))
+
+
+@pytest.mark.parametrize("name", WORLD_MODELS)
+def test_the_presets_of_the_paper_have_its_depth_branch_and_those_of_physics_a_head(name: str) -> None:
+    model = presets.get(name).model
+    if name.startswith("roboscape_physics"):
+        assert isinstance(model, RoboScapeConfig)
+        paper = presets.get(name.replace("_physics", "")).model
+        assert isinstance(paper, RoboScapeConfig)
+        assert model == replace(paper, depth=DepthHead(), loss=replace(paper.loss, keypoints="none"))
+    else:
+        assert Architecture.create(presets.get(name)).depth == ("branch" if name.startswith("roboscape") else "none")
 
 
 def test_full_size_presets_of_every_family_are_scored_alike() -> None:

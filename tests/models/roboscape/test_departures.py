@@ -7,7 +7,10 @@ import pytest
 
 from rsjax.config import CorruptionConfig, Departures, SampleConfig, TokenModelConfig, presets
 
-FULL_SIZE = ("roboscape_s", "roboscape_m", "roboscape_l", "genie_35m", "genie_138m", "genie_35m_actions")
+SIZES = ("s", "m", "l")
+ROBOSCAPE = tuple(f"roboscape_{size}" for size in SIZES)
+PHYSICS = tuple(f"roboscape_physics_{size}" for size in SIZES)
+FULL_SIZE = (*ROBOSCAPE, *PHYSICS, "genie_35m", "genie_138m", "genie_35m_actions")
 KEYPOINTS = {"observed_anchor": True, "visible_keypoints": True}
 TINY = KEYPOINTS | {
     "integrate_actions": True,

@@ -116,7 +116,7 @@ def read_arm(claim: Claim, name: str, plan: Plan, known: Mapping[str, RunResult]
 
 def _numbers(claim: Claim, finished: Sequence[RunResult], read: ReadScores) -> dict[str, list[float | None]]:
     """Returns the scores over all clips: of the claim's metrics, of baselines, and those shown beside them."""
-    compared = dict.fromkeys(each.metric for each in claim.comparisons)
+    compared = dict.fromkeys([*(each.metric for each in claim.comparisons), *claim.shown])
     names = dict.fromkeys([*compared, *(f"{name}{suffix}" for name in compared for suffix in BASELINES), CEILING])
     found: dict[str, list[float | None]] = {}
     for name in names:

@@ -100,6 +100,7 @@ class Claim:
         place: the place in the paper, such as "Table 2".
         arms: what is trained. Arms with the same configuration are trained once for all claims.
         comparisons: the parts of the claim.
+        shown: further metrics that the report shows for each arm, but does not compare.
         beside: further scores that the report shows for each arm: score → the measurement that it is from.
         rank: claims of rank 0 run first, with all their seeds; then the others by rank, each with two seeds; then
             their further seeds.
@@ -112,6 +113,7 @@ class Claim:
     place: str
     arms: tuple[Arm, ...]
     comparisons: tuple[Comparison, ...]
+    shown: tuple[str, ...] = ()
     beside: Mapping[str, str] = field(default_factory=dict)
     rank: int = 5
     notes: tuple[str, ...] = ()

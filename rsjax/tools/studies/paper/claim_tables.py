@@ -122,8 +122,9 @@ def claim_figure(outcome: Outcome, source: str = "") -> bytes | None:
 
 
 def _columns(outcome: Outcome) -> list[Metric]:
-    """Returns the metrics by which a claim compares the arms' own evaluations."""
-    return _known([each.metric for each in outcome.claim.comparisons if not each.measurement])
+    """Returns the metrics of the arms' own evaluations that a claim compares or shows."""
+    compared = [each.metric for each in outcome.claim.comparisons if not each.measurement]
+    return _known([*compared, *outcome.claim.shown])
 
 
 def _published_columns(outcome: Outcome) -> list[Metric]:

@@ -23,7 +23,7 @@ from rsjax.tools.studies.paper.judge import Outcome, judge_claim
 
 KIND = "measured"
 MOST_BYTES = 300_000
-OF_CLAIM = ("name", "title", "statement", "place", "notes", "beside")
+OF_CLAIM = ("name", "title", "statement", "place", "notes", "shown", "beside")
 
 
 def write_result(path: Path, outcome: Outcome, about: Mapping[str, Any], most: int = MOST_BYTES) -> None:
@@ -75,6 +75,7 @@ def read_result(path: Path) -> Outcome:
                 "arms": tuple(Arm(arm["name"], equal=arm["equal"], published=arm["published"]) for arm in arms),
                 "comparisons": tuple(Comparison(**each) for each in content["claim"]["comparisons"]),
                 "notes": tuple(content["claim"]["notes"]),
+                "shown": tuple(content["claim"]["shown"]),
             }
         )
         return judge_claim(claim, [_arm_scores(arm, path.with_suffix(".npz")) for arm in arms])

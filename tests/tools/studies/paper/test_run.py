@@ -259,6 +259,31 @@ def test_a_run_of_the_preset_is_a_cell_and_its_scores_are_in_the_report(
     assert (tmp_path / "report.html").exists() and (tmp_path / "figures" / "table2.png").exists()
 
 
+def test_a_budget_may_spend_more_than_its_trainings_are_sized_for(
+    command: Commands, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def planned(*options: str) -> list[str]:
+        main(
+            "--seeds",
+            "5",
+            "--vary",
+            "everything",
+            "--data-dir",
+            command.data,
+            "--only",
+            "depth-ways",
+            "--dry-run",
+            *options,
+        )
+        lines = capsys.readouterr().out.splitlines()
+        return [line.split()[3] for line in lines if " missing " in line]
+
+    short = planned("--budget", "3h")
+    long = planned("--budget", "12h", "--size", "3h")
+    assert long[: len(short)] == short
+    assert len(long) == 20 > len(short)
+
+
 def test_seconds_a_frame_stand_beside_each_arm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Those of the predicted frames of one clip, from its prompt."""
     clip: dict[str, Any] = {

@@ -5,7 +5,8 @@ from typing import Literal
 
 from rsjax.tools.studies.paper.claim import Arm, Claim, pairs, register
 
-_METRICS = ("psnr", "psnr_motion", "delta_psnr", "ssim")
+_METRICS = ("psnr", "psnr_motion", "delta_psnr", "depth_absrel_median_estimator")
+_SHOWN = ("ssim", "lpips", "gripper_error_widths", "cube_error_widths", "depth_delta1_median_estimator")
 
 # Without keypoint terms, which have claims of their own.
 _ALONE = {"model.loss.keypoints": "none"}
@@ -26,6 +27,7 @@ def _register(name: str, equal: Literal["seconds", "flops", "steps"], title: str
             place="a choice of ours beside §2.3",
             arms=tuple(replace(arm, equal=equal) for arm in _ARMS),
             comparisons=tuple(pair for arm in _ARMS[1:] for pair in pairs(_ARMS[0].name, arm.name, *_METRICS)),
+            shown=_SHOWN,
             rank=rank,
             notes=(
                 f"All arms train for equal {title}, each with the learning rate of the preset.",
