@@ -32,8 +32,7 @@ def _register(name: str, equal: Literal["seconds", "flops", "steps"], title: str
             rank=rank,
             notes=(
                 f"All arms train for equal {title}.",
-                "Branch and Genie have the best of four learning rates; the others have Genie's, which was not tuned for "
-                "them.",
+                "Branch and Genie have the best of four learning rates; the others have Genie's, not tuned for them.",
                 "No arm has keypoint terms. Twice the blocks without depth are the paper's branches without depth.",
             ),
         )
