@@ -19,8 +19,10 @@ class Options:
     """First copy what a study has measured for these claims."""
     study: Path = Path("runs/paper")
     """The directory of experiments.paper that --add takes the claims from."""
+    run: tuple[Path, ...] = ()
+    """First write the scores of these finished runs, which differ in their seeds."""
     name: str = ""
-    """The name of the file that --add writes, if it is not the claim's: table1-multitask."""
+    """The name of the file that --run writes; or --add, if it is not the claim's: table1-multitask."""
     check: bool = False
     """Change nothing; name each table that differs from its file, and exit with 2 if there is any."""
 
@@ -32,9 +34,13 @@ def main() -> None:
     from rsjax.tools.studies import result_pages
 
     root = Path(__file__).resolve().parents[1]
-    require(not options.name or len(options.add) == 1, "--name names the file of one claim; --add has another number")
+    named = len(options.add) + bool(options.run)
+    require(not options.name or named == 1, f"--name names one file, but --add and --run write {named}")
+    require(not options.run or bool(options.name), "--run needs --name, the name of its file, such as tiny")
     for claim in options.add:
         print(result_pages.add_result(root, options.study, claim, options.name))
+    if options.run:
+        print(result_pages.add_runs(root, options.run, options.name))
     if options.check:
         differing = list(result_pages.differences(root))
         if differing:

@@ -1,19 +1,22 @@
 """Pages whose tables are generated from files of results.
 
 A page has a table between two lines, ``<!-- table NAME PART -->`` and ``<!-- end -->``: that part of the file
-``NAME.json``. The file's ``kind`` says how it is read: "measured" (:mod:`rsjax.tools.studies.paper.result_files`) or
-"transcribed" (:mod:`rsjax.tools.studies.transcribed`). A picture ``docs/results/NAME.png`` that a page shows is drawn
-from ``NAME.json`` if that was measured.
+``NAME.json``. The file's ``kind`` says how it is read: "measured" (:mod:`rsjax.tools.studies.paper.result_files`),
+"run" (:mod:`rsjax.tools.studies.run_results`) or "transcribed" (:mod:`rsjax.tools.studies.transcribed`). A picture
+``docs/results/NAME.png`` that a page shows is drawn from ``NAME.json`` if that was measured.
 """
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from PIL import Image
 
 from rsjax.errors import UserError, did_you_mean
 from rsjax.files import read_json, write_file
+from rsjax.models.load_run import load_config
+from rsjax.tools.pipeline.run import Run
+from rsjax.tools.studies import run_results
 from rsjax.tools.studies.paper.claim_tables import claim_content, claim_figure, claim_tables
 from rsjax.tools.studies.paper.report import RESULTS
 from rsjax.tools.studies.paper.result_files import KIND, about_result, content_key, read_result
@@ -43,13 +46,16 @@ def part_of(root: Path, name: str, part: str) -> str:
         raise UserError(f"{DATA} has no {name}.json{did_you_mean(name, names)}")
     path = root / DATA / f"{name}.json"
     content = read_json(path)
+    below = ""
     if content["kind"] == KIND:
         claim = claim_content(read_result(path))
         tables = claim_tables(claim)
         below = f"\n\n{claim['caption']} {about_result(path)}."
+    elif content["kind"] == run_results.KIND:
+        tables = run_results.run_tables(content)
+        below = f"\n\n{run_results.about_runs(content)}"
     else:
         tables = {key: transcribed_table(table) for key, table in content["tables"].items()}
-        below = ""
     if part not in tables:
         raise UserError(f"{DATA}/{name}.json has no part {part}{did_you_mean(part, tables)} ({', '.join(tables)})")
     return as_markdown(tables[part], aligned=False) + below
@@ -74,6 +80,20 @@ def add_result(root: Path, study: Path, claim: str, name: str = "") -> Path:
         path.with_suffix(suffix).unlink(missing_ok=True)
         if source.with_suffix(suffix).exists():
             write_file(path.with_suffix(suffix), source.with_suffix(suffix).read_bytes())
+    return path
+
+
+def add_runs(root: Path, runs: Sequence[Path], name: str) -> Path:
+    """Writes the scores of finished runs to the files of results, and returns the new file.
+
+    Args:
+        runs: directories of runs that differ in their seeds.
+
+    Raises:
+        UserError: a run is missing or not finished.
+    """
+    path = root / DATA / f"{name}.json"
+    run_results.write_runs(path, [Run(load_config(run), run, Path("data")) for run in runs])
     return path
 
 

@@ -1,6 +1,7 @@
 """Pages whose tables are generated from files of results."""
 
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -9,8 +10,11 @@ from typing import Any
 import pytest
 
 from rsjax.errors import UserError
-from rsjax.tools.studies.result_pages import DATA, FOLDER, differences, part_of, write_pages
+from rsjax.evaluation.statistics import wilson
+from rsjax.tools.studies.result_pages import DATA, FOLDER, add_runs, differences, part_of, write_pages
+from tests.tools.pipeline.conftest import command, debug, shared
 
+__all__ = ["command", "debug", "shared"]  # fixtures
 ROOT = Path(__file__).resolve().parents[3]
 PAGE = """# A page
 
@@ -69,6 +73,31 @@ def test_a_changed_table_is_named_with_its_page_and_made_anew(root: Path) -> Non
     assert list(differences(root)) == [f"{FOLDER}/page.md: table one arms differs from {DATA}/one.json"]
     write_pages(root)
     assert page.read_text() == text
+
+
+def test_a_run_becomes_a_file_and_the_table_of_its_scores(root: Path, debug: Path) -> None:
+    add_runs(root, [debug], "tiny")
+    metrics = json.loads((debug / "metrics.json").read_text())
+    lines = part_of(root, "tiny", "scores").splitlines()
+    prediction, repeated, reconstruction, truth = (line.split(" | ") for line in lines[2:6])
+    assert lines[0].split(" | ")[1:3] == ["PSNR, dB ↑", "PSNR where it moves, dB ↑"]
+    assert prediction[1] == f"{metrics['psnr']:.2f}" and repeated[1] == f"{metrics['psnr_repeat_first']:.2f}"
+    assert reconstruction[1] == f"{metrics['psnr_tokenizer']:.2f}" and truth[1] == ""
+    right = round(2 * metrics["lifted_accuracy"])
+    interval = wilson(right, 2)
+    assert prediction[-1] == f"{right / 2:.0%} ({interval.low:.0%} … {interval.high:.0%}) |".replace("%", " %")
+    assert lines[-1].startswith("Preset `debug`, 1 run (seed 0), 2 held-out clips; commit ")
+
+
+def test_the_runs_of_a_file_are_finished(root: Path, debug: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other"
+    shutil.copytree(debug, other)
+    config = json.loads((other / "config.json").read_text())
+    config["train"]["seed"] = 1
+    (other / "config.json").write_text(json.dumps(config))
+    with pytest.raises(UserError, match=r"other: not a finished run"):
+        add_runs(root, [debug, other], "tiny")
+    assert not (root / DATA / "tiny.json").exists()
 
 
 def test_a_table_without_a_file_is_named(root: Path) -> None:

@@ -42,7 +42,7 @@ def write_result(path: Path, outcome: Outcome, about: Mapping[str, Any], most: i
     content["claim"] = {name: getattr(claim, name) for name in OF_CLAIM}
     content["claim"]["comparisons"] = [asdict(each) for each in claim.comparisons]
     content["arms"] = [_arm_content(arm, claim.arm(arm.name)) for arm in outcome.arms]
-    text = _text(content)
+    text = as_text(content)
     path.with_suffix(".npz").unlink(missing_ok=True)
     if len(text) > most:
         arrays: dict[str, Any] = {}
@@ -56,7 +56,7 @@ def write_result(path: Path, outcome: Outcome, about: Mapping[str, Any], most: i
         buffer = BytesIO()
         np.savez_compressed(buffer, **arrays)
         write_file(path.with_suffix(".npz"), buffer.getvalue())
-        text = _text(content)
+        text = as_text(content)
     write_file(path, text.encode())
 
 
@@ -147,7 +147,7 @@ def _arm_scores(content: Mapping[str, Any], beside: Path) -> ArmScores:
     return ArmScores(**values | {name: tuple(values[name]) for name in ("seeds", "trainings", "clips")})
 
 
-def _text(content: Mapping[str, Any]) -> str:
+def as_text(content: Mapping[str, Any]) -> str:
     """Returns JSON with a line for each entry of the outer two levels of objects, so that differences can be read."""
     lines = []
     for key, value in content.items():

@@ -7,7 +7,7 @@ from rsjax.tools.studies.paper.claim import Arm, Claim, pairs, register
 from rsjax.tools.studies.paper.claims.baselines import RATES
 
 _METRICS = ("psnr", "psnr_motion", "delta_psnr", "depth_absrel_median_estimator")
-_SHOWN = ("ssim", "lpips", "gripper_error_widths", "cube_error_widths", "depth_delta1_median_estimator")
+_SHOWN = ("ssim", "lpips_alex", "gripper_error_widths", "cube_error_widths", "depth_delta1_median_estimator")
 
 # Without keypoint terms, which have claims of their own.
 _ALONE = {"model.loss.keypoints": "none"}

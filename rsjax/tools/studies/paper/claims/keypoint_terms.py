@@ -28,7 +28,7 @@ register(
             for name in _TERMS
             for pair in pairs(name, "without", "psnr_motion", "cube_error_widths", "gripper_error_widths", "psnr")
         ),
-        shown=("delta_psnr", "lpips", "depth_absrel_median_estimator"),
+        shown=("delta_psnr", "lpips_alex", "depth_absrel_median_estimator"),
         rank=3,
         notes=("All arms train for the same steps. The terms that are not in the paper come without Eq. 7.",),
     )

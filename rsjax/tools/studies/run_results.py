@@ -1,0 +1,117 @@
+"""Files of results of single runs: the scores of trainings of one configuration, and the table that shows them.
+
+A file of kind "run" has the scores of each run over its held-out clips, and those of each clip.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rsjax.config import require
+from rsjax.config.run import Config
+from rsjax.errors import UserError
+from rsjax.evaluation.registry import metrics
+from rsjax.evaluation.statistics import wilson
+from rsjax.files import write_file
+from rsjax.tools.pipeline.run import Run
+from rsjax.tools.studies.paper.arm_scores import CLIP_DIGITS, SEED_DIGITS, rounded
+from rsjax.tools.studies.paper.result_files import as_text, provenance
+from rsjax.tools.studies.results import read_metrics, read_per_clip, spread
+from rsjax.tools.studies.tables import Table, mean_text
+
+KIND = "run"
+COLUMNS = (
+    "psnr",
+    "psnr_motion",
+    "delta_psnr",
+    "ssim",
+    "lpips_alex",
+    "depth_absrel",
+    "cube_error_widths",
+    "gripper_error_widths",
+)
+LIFTED = "lifted_accuracy"
+ROWS = {
+    "": "prediction",
+    "_repeat_first": "first frame repeated",
+    "_tokenizer": "tokenizer's reconstruction",
+    "_truth": "true frames",
+}
+
+
+def write_runs(path: Path, runs: Sequence[Run]) -> None:
+    """Writes the scores of finished runs that differ in nothing but their seeds.
+
+    Raises:
+        UserError: a run is not finished, or two differ in more than their seeds.
+    """
+    names = [f"{name}{suffix}" for name in (*COLUMNS, LIFTED) for suffix in ROWS]
+    scores = []
+    for run in runs:
+        found = read_metrics(run)
+        if found is None:
+            raise UserError(f"{run.directory}: not a finished run; finish it with experiments.train")
+        require(
+            _without_seeds(run.config) == _without_seeds(runs[0].config),
+            f"{run.directory} has another configuration than {runs[0].directory}; give runs that differ in their seeds",
+        )
+        per_clip = read_per_clip(run)
+        clips = {name: [rounded(x, CLIP_DIGITS) for x in per_clip[name]] for name in names if name in per_clip}
+        numbers = {name: rounded(found[name], SEED_DIGITS) for name in names if name in found}
+        scores.append({"seed": run.config.train.seed, "metrics": numbers, "clips": clips})
+    about = {"kind": KIND, "preset": runs[0].config.name, "training_clips": runs[0].config.sim.episodes}
+    write_file(path, as_text(about | provenance(runs) | {"runs": scores}).encode())
+
+
+def _without_seeds(config: Config) -> Any:
+    """Returns a configuration as a dictionary without its seeds."""
+    return _strip(asdict(config))
+
+
+def _strip(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _strip(part) for name, part in value.items() if name != "seed"}
+    return value
+
+
+def run_tables(content: Mapping[str, Any]) -> dict[str, Table]:
+    """Returns the table "scores" of a file: the prediction and what it is compared with, as means over the runs.
+
+    The share of clips in which "lifted" is read correctly has Wilson's interval over the clips of all runs.
+    """
+    known = metrics()
+    shown = [name for name in COLUMNS if any(name in run["metrics"] for run in content["runs"])]
+    head = ["", *(known[name].heading for name in shown), '"lifted" read correctly, 95 % interval']
+    rows = []
+    for suffix, label in ROWS.items():
+        cells = [_mean(content["runs"], f"{name}{suffix}", known[name].decimals) for name in shown]
+        rows.append([label, *cells, _share(content["runs"], f"{LIFTED}{suffix}")])
+    return {"scores": Table(head, rows)}
+
+
+def about_runs(content: Mapping[str, Any]) -> str:
+    """Returns how many runs and clips a file's table is of, and where they are from."""
+    runs = content["runs"]
+    clips = " and ".join(str(len(run["clips"]["psnr"])) for run in runs)
+    seeds = ", ".join(str(run["seed"]) for run in runs)
+    commits = ", ".join(commit[:7] for commit in content["commits"])
+    return (
+        f"Preset `{content['preset']}`, {len(runs)} run{'s' * (len(runs) > 1)} (seed {seeds}), {clips} held-out clips; "
+        f"commit {commits}; {', '.join(content['machines'])}; {content['dates']}."
+    )
+
+
+def _mean(runs: Sequence[Mapping[str, Any]], name: str, decimals: int) -> str:
+    values = [run["metrics"][name] for run in runs if name in run["metrics"]]
+    return mean_text(spread(values), decimals) if values else ""
+
+
+def _share(runs: Sequence[Mapping[str, Any]], name: str) -> str:
+    right = np.array([x for run in runs for x in run["clips"].get(name, ())])
+    if not right.size:
+        return ""
+    share = wilson(int(right.sum()), right.size)
+    return f"{share.value:.0%} ({share.low:.0%} … {share.high:.0%})".replace("%", " %")
