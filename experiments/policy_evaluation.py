@@ -23,10 +23,14 @@ class Options(Trials):
     """Directory of simulated data sets."""
     judge: Path | None = None
     """Folder of the judge for all runs; default: the first run's own (experiments.judge)."""
+    imagined: int = 0
+    """Episodes of each policy in a world model, at least --episodes; 0: four times as many as --episodes."""
     policies: tuple[Path, ...] = ()
-    """Directories of trained policies to compare; default: checkpoints of one policy trained on real demonstrations."""
+    """Directories of trained policies to compare; default: checkpoints of policies trained on real demonstrations."""
+    trainings: int = 2
+    """Number of trainings of that policy, with seeds of their own, for an interval of r over trainings."""
     checkpoints: int = 8
-    """Number of checkpoints of that policy."""
+    """Number of checkpoints of each training."""
     demos: int = 200
     """Number of demonstrations that it is trained on."""
     size: str = "tiny"
@@ -46,12 +50,14 @@ def main() -> None:
     """Writes results.json, results.md, scatter.png and videos, and prints the table."""
     tune_process()
     options = parse_options(sys.argv[1:], "python -m experiments.policy_evaluation", Options.__doc__ or "", Options())
-    if not options.runs or options.checkpoints < 2:
-        raise ConfigError("name a run directory at least, and --checkpoints 2 or more: policy_evaluation runs/tiny")
+    if not options.runs or options.checkpoints < 2 or options.trainings < 1:
+        raise ConfigError(
+            "name a run directory at least, --checkpoints 2 or more, --trainings 1 or more: policy_evaluation runs/tiny"
+        )
     from rsjax.tools.policies.judges.judge_training import FOLDER
     from rsjax.tools.policies.policy import common_size, load_policy
-    from rsjax.tools.policies.run_data import RunData, named, sized_policy
-    from rsjax.tools.policies.studies.policy_evaluation import checkpoints, compare
+    from rsjax.tools.policies.run_data import RunData, named, replicates, sized_policy, training_of
+    from rsjax.tools.policies.studies.policy_evaluation import compare, trained_policies
     from rsjax.tools.policies.studies.rejudging import blind, named_judge, rejudge
     from rsjax.tools.policies.studies.trials import open_lift
 
@@ -71,15 +77,28 @@ def main() -> None:
         run.check_world(first)
     first.judge(judge)
     config = first.simulator
+    imagined = options.imagined or 4 * trials.episodes
     if options.policies:
-        policies = {name: load_policy(place) for name, place in named(options.policies).items()}
+        places = named(options.policies)
+        policies = {name: load_policy(place) for name, place in places.items()}
+        training = {name: training_of(place) for name, place in places.items()}
     else:
         demos = first.demos().first(options.demos)
-        policies = checkpoints(sized_policy(options.size, options.steps), demos, out / "policy", options.checkpoints)
+        size = sized_policy(options.size, options.steps)
+        policies, training = trained_policies(size, demos, out, options.checkpoints, options.trainings)
     common_size(policies.values())
     worlds = {name: partial(run.world, trials.together, judge) for name, run in runs.items()}
     with open_lift(config, trials) as simulator:
-        compare(policies, simulator, worlds, trials, out)
+        compare(
+            policies,
+            simulator,
+            worlds,
+            trials,
+            out,
+            imagined=imagined,
+            training=training,
+            replicates=replicates(runs),
+        )
     print((out / "results.md").read_text(), out, sep="\n")
 
 

@@ -1,16 +1,18 @@
 """Loads what the policy experiments take from a run: its clips, simulator, judge and world model."""
 
-from collections.abc import Sequence
+import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
-from rsjax.config import Config, SimConfig, from_dict
+from rsjax.config import Config, SimConfig, content_key, from_dict
 from rsjax.data.clips import readable
 from rsjax.data.store import Store, open_store
 from rsjax.errors import UserError
 from rsjax.models.load_run import load, load_config
 from rsjax.models.trained import TrainedModel
+from rsjax.tools.pipeline.provenance import training_settings
 from rsjax.tools.pipeline.run import Run
 from rsjax.tools.pipeline.run_clips import relocated
 from rsjax.tools.policies.config import PolicyConfig, policy_preset
@@ -150,3 +152,24 @@ def named(runs: Sequence[Path]) -> dict[str, Path]:
         if len(set(names) - TAKEN) == len(names):
             return dict(zip(names, runs, strict=True))
     raise UserError(f"two of the runs {', '.join(map(str, runs))} are the same; name each once")
+
+
+def training_of(policy: Path) -> str:
+    """Returns the directory of the training that a policy's directory is from: of ``at-50``, the one it is in."""
+    place = policy.absolute()
+    if place.name.startswith("at-"):
+        place = place.parent
+    return str(place)
+
+
+def replicates(runs: Mapping[str, RunData]) -> dict[str, str]:
+    """Returns for each run the name of the first run that differs from it in the seeds of its trainings alone."""
+    first: dict[str, str] = {}
+    found = {}
+    for name, run in runs.items():
+        config = run.config
+        data = config.data or replace(config.sim, seed=0)
+        settings = json.dumps(training_settings(config), sort_keys=True)
+        key = content_key(settings, config.model, config.prompt_frames, data)
+        found[name] = first.setdefault(key, name)
+    return found

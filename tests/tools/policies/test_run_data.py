@@ -10,7 +10,7 @@ from rsjax.errors import UserError
 from rsjax.files import write_json
 from rsjax.tools.policies.judges.judge import HISTORY
 from rsjax.tools.policies.judges.trained_judge import Network, TrainedJudge
-from rsjax.tools.policies.run_data import RunData
+from rsjax.tools.policies.run_data import RunData, replicates, training_of
 
 
 def run(path: Path, config: Config, trained: bool = True) -> RunData:
@@ -53,3 +53,17 @@ def test_a_judge_of_frames_of_another_size_is_named(tmp_path: Path) -> None:
         UserError, match=r"judge-60/judge.msgpack: was trained on frames of 60 × 60 pixels, these have 64 × 64"
     ):
         first.judge(tmp_path / "judge-60")
+
+
+def test_runs_that_differ_in_seeds_alone_are_replicates(tmp_path: Path) -> None:
+    config = presets.debug()
+    seeds = replace(config, train=replace(config.train, seed=1), sim=replace(config.sim, seed=2), name="other")
+    longer = replace(config, train=replace(config.train, steps=config.train.steps + 1))
+    runs = {"a": config, "b": longer, "c": seeds, "d": config.with_family("genie")}
+    found = replicates({name: run(tmp_path / name, one) for name, one in runs.items()})
+    assert found == {"a": "a", "b": "b", "c": "a", "d": "d"}
+
+
+def test_the_stages_of_a_training_are_of_one_training(tmp_path: Path) -> None:
+    assert training_of(tmp_path / "policy" / "at-50") == training_of(tmp_path / "policy") == str(tmp_path / "policy")
+    assert training_of(tmp_path / "policy-seed1") != training_of(tmp_path / "policy")

@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from rsjax.errors import UserError
+from rsjax.evaluation.prediction_powered import corrected_rate
 from rsjax.evaluation.statistics import Estimate, wilson
 from rsjax.files import write_file, write_json
 from rsjax.progress import note, stage
@@ -15,11 +17,11 @@ from rsjax.tools.policies.demos import Demos
 from rsjax.tools.policies.judges.validation import markdown, summary
 from rsjax.tools.policies.policy import Policy, load_policy
 from rsjax.tools.policies.policy_training import train_policy
-from rsjax.tools.policies.studies.agreement import agreement
+from rsjax.tools.policies.studies.agreement import agreement, inner, over_trainings
 from rsjax.tools.policies.studies.figures import scatter, side_by_side
 from rsjax.tools.policies.studies.policy_learning import interval_text, percent
 from rsjax.tools.policies.studies.trials import FPS, Result, Trials, first_frames, try_policy
-from rsjax.tools.policies.worlds.world import World
+from rsjax.tools.policies.worlds.world import FIRST_SEED, World
 from rsjax.tools.studies.report.video import write_mp4
 from rsjax.tools.studies.tables import ABSENT, Table, as_markdown
 
@@ -33,14 +35,27 @@ NUMBERS = {
     "mmrv": "MMRV",
 }
 AGREEMENT_HEAD = ("run", "Pearson r", "95 %", *NUMBERS.values(), "bias", "same outcome", "uninterpretable")
-SUCCESS_HEAD = ("policy", "in", "success", "95 %", "uninterpretable", "numbers clipped")
+MIDDLE_HEAD = ("run", "r without 0 and 100 %", "95 %", "policies", "bias at 10 to 90 %")
+TRAININGS_HEAD = ("runs", "trainings of policies", "r", "95 %", "r without 0 and 100 %", "95 %")
+SUCCESS_HEAD = ("policy", "in", "success", "95 %", "corrected", "95 %", "trials saved", "uninterpretable", "clipped")
 FORMULAS = (
     "x: success in the simulator, y: in the world model. R² of y = x is 1 - Σ(y - x)² / Σ(y - ȳ)²; R² of y for x, a "
     "prediction of x, is 1 - Σ(y - x)² / Σ(x - x̄)². Where y spreads more than x, the first is higher; signs may differ."
 )
+CORRECTED = (
+    "Corrected: the rate in the world model, corrected by the trials that are paired with true ones. Trials saved: how "
+    "many more trials in the simulator alone would give an interval as narrow (docs/policy_learning.md)."
+)
+TRAININGS = (
+    "Over trainings: r is the mean over the runs that differ in their seeds alone. Its interval is for other trainings "
+    "of policies, of which it takes two at least, and, with two runs or more, of the world model."
+)
+FIRST_TRAINING = "policy"
 
 
-def checkpoints(config: PolicyConfig, demos: Demos, directory: Path, count: int = 8) -> dict[str, Policy]:
+def checkpoints(
+    config: PolicyConfig, demos: Demos, directory: Path, count: int = 8, seed: int = 0
+) -> dict[str, Policy]:
     """Trains one policy and returns it at ``count`` stages of its training, from useless to good, by name.
 
     A very short training has fewer stages; a note then says so.
@@ -50,8 +65,32 @@ def checkpoints(config: PolicyConfig, demos: Demos, directory: Path, count: int 
     stops = sorted({max(1, round(share * steps)) for share in shares} - {steps})
     if len(stops) < count - 1:
         note(f"{steps} training steps have {len(stops) + 1} stages, not {count}; more steps, or fewer checkpoints")
-    last = train_policy(config, demos, directory, name="policy", stops=stops)
+    last = train_policy(config, demos, directory, name=directory.name, seed=seed, stops=stops)
     return {f"step-{stop}": load_policy(directory / f"at-{stop}") for stop in stops} | {f"step-{steps}": last}
+
+
+def trained_policies(
+    config: PolicyConfig, demos: Demos, out: Path, count: int, trainings: int
+) -> tuple[dict[str, Policy], dict[str, str]]:
+    """Trains a policy with several seeds, and returns all its stages by name, and the name of each one's training.
+
+    Args:
+        count: stages of each training, as in :func:`checkpoints`.
+        trainings: number of seeds; each trains in a folder of ``out``.
+    """
+    policies: dict[str, Policy] = {}
+    training: dict[str, str] = {}
+    for seed in range(trainings):
+        name = FIRST_TRAINING
+        if seed:
+            name = f"{FIRST_TRAINING}-seed{seed}"
+        for stage_name, policy in checkpoints(config, demos, out / name, count, seed).items():
+            full = stage_name
+            if seed:
+                full = f"seed{seed}-{stage_name}"
+            policies[full] = policy
+            training[full] = name
+    return policies, training
 
 
 def compare(
@@ -60,6 +99,10 @@ def compare(
     models: Mapping[str, Callable[[], World]],
     trials: Trials,
     out: Path,
+    *,
+    imagined: int = 0,
+    training: Mapping[str, str] | None = None,
+    replicates: Mapping[str, str] | None = None,
 ) -> dict[str, Any]:
     """Runs each policy from the same first frames in the simulator and in each world model; keeps finished results.
 
@@ -69,29 +112,47 @@ def compare(
         models: functions that make the world of each run, by the run's name.
         out: the folder of all rollouts, ``results.json`` (null: undefined, such as a correlation without variation),
             ``results.md``, ``scatter.png`` and videos (left: simulator, right: world model).
+        imagined: episodes of each policy in a world model. Those beyond ``trials.episodes`` start from first frames of
+            their own, and nobody runs them in the simulator. 0: as many as there.
+        training: the name of the training that each policy is from, for intervals over trainings; None: one training.
+        replicates: for each run, the name of the first run that differs from it in seeds alone; None: each its own.
 
     Returns:
         The content of ``results.json``.
+
+    Raises:
+        UserError: fewer episodes are to be imagined than simulated.
     """
-    frames = first_frames(simulator, trials.seeds, out / "starts.npz")
+    imagined = imagined or trials.episodes
+    if imagined < trials.episodes:
+        raise UserError(f"--imagined is {imagined}; it must be at least --episodes, which is {trials.episodes}")
+    seeds = [FIRST_SEED + number for number in range(imagined)]
+    frames = first_frames(simulator, seeds, out / "starts.npz")
     true: dict[str, Result] = {}
     for name, policy in policies.items():
-        folder = out / "simulator" / name
         true[name] = try_policy(
-            policy, simulator, trials.seeds, trials, folder, f"{name} in simulator", save_frames=True
+            policy,
+            simulator,
+            trials.seeds,
+            trials,
+            out / "simulator" / name,
+            f"{name} in simulator",
+            save_frames=trials.episodes,
         )
     rows: list[dict[str, Any]] = []
     for number, (run, make) in enumerate(models.items(), 1):
         stage(number, len(models), run, "rolling policies out in this world model")
         world = make()
-        imagined = {}
+        made = {}
         for name, policy in policies.items():
-            folder = out / run / name
-            imagined[name] = try_policy(policy, world, frames, trials, folder, f"{name} in {run}", save_frames=True)
+            made[name] = try_policy(
+                policy, world, frames, trials, out / run / name, f"{name} in {run}", save_frames=trials.episodes
+            )
             _videos(out, run, name, trials)
-        rows.append(compared(run, true, imagined) | {"judge": summary(world.validation)})
+        row = compared(run, true, made, training or {})
+        rows.append(row | {"like": (replicates or {}).get(run, run), "judge": summary(world.validation)})
         write_results(out, rows, trials)
-    return {"trials": asdict(trials), "runs": rows}
+    return results_of(rows, trials)
 
 
 def _videos(out: Path, run: str, name: str, trials: Trials) -> None:
@@ -103,25 +164,63 @@ def _videos(out: Path, run: str, name: str, trials: Trials) -> None:
             write_mp4(out / "videos" / f"{run}-{name}-{number:02d}.mp4", side_by_side(sides), FPS, 4)
 
 
-def compared(run: str, true: Mapping[str, Result], imagined: Mapping[str, Result]) -> dict[str, Any]:
-    """Returns a run's entry in ``results.json``: success in both worlds by policy, and how well they agree."""
+def compared(
+    run: str, true: Mapping[str, Result], imagined: Mapping[str, Result], training: Mapping[str, str]
+) -> dict[str, Any]:
+    """Returns a run's entry in ``results.json``: success in both worlds by policy, and how well they agree.
+
+    Args:
+        true: by policy; its episodes start as the first ones of ``imagined`` do.
+        training: the name of each policy's training.
+    """
     x, y = (np.array([np.mean(results[name].success) for name in true]) for results in (true, imagined))
-    policies: dict[str, dict[str, Any]] = {
-        name: {
-            "simulator": true[name].success,
+    policies: dict[str, dict[str, Any]] = {}
+    same: list[bool] = []
+    for name, made in imagined.items():
+        real = true[name].success
+        paired = made.success[: len(real)]
+        same += np.equal(real, paired).tolist()
+        policies[name] = {
+            "training": training.get(name, FIRST_TRAINING),
+            "simulator": real,
             "world_model": made.success,
+            "corrected": asdict(corrected_rate(real, paired, made.success[len(real) :])),
             "uninterpretable": made.uninterpretable,
             "clipped": {"simulator": true[name].clipped, "world_model": made.clipped},
         }
-        for name, made in imagined.items()
-    }
-    same = np.mean([np.equal(each["simulator"], each["world_model"]) for each in policies.values()])
     spoilt = np.mean([each["uninterpretable"] for each in policies.values()])
     if len(true) > 1:
         found = _defined(asdict(agreement(x, y)))
     else:
         found = {}
-    return {"run": run, "policies": policies, "same_outcome": float(same), "uninterpretable": float(spoilt), **found}
+    return {
+        "run": run,
+        "policies": policies,
+        "same_outcome": float(np.mean(same)),
+        "uninterpretable": float(spoilt),
+        **found,
+    }
+
+
+def trainings(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Returns r over the runs that differ in seeds alone, with intervals for other trainings, for each such group."""
+    found = []
+    for like in dict.fromkeys(row["like"] for row in rows):
+        group = [row for row in rows if row["like"] == like]
+        policies = group[0]["policies"]
+        training = np.array([each["training"] for each in policies.values()])
+        x = np.array([np.mean(each["simulator"]) for each in policies.values()])
+        y = np.array([[np.mean(each["world_model"]) for each in row["policies"].values()] for row in group])
+        kept = inner(x)
+        found.append(
+            {
+                "runs": [row["run"] for row in group],
+                "policies": len(set(training.tolist())),
+                "pearson": _defined(asdict(over_trainings(x, y, training.tolist()))),
+                "pearson_inner": _defined(asdict(over_trainings(x[kept], y[:, kept], training[kept].tolist()))),
+            }
+        )
+    return found
 
 
 def _defined(numbers: dict[str, Any]) -> dict[str, Any]:
@@ -132,11 +231,17 @@ def _defined(numbers: dict[str, Any]) -> dict[str, Any]:
 
 def write_results(out: Path, rows: Sequence[dict[str, Any]], trials: Trials) -> None:
     """Writes ``results.json``, ``results.md`` and ``scatter.png`` of the runs that are finished."""
-    write_json(out / "results.json", {"trials": asdict(trials), "runs": list(rows)})
-    write_file(out / "results.md", table(rows).encode())
+    results = results_of(rows, trials)
+    write_json(out / "results.json", results)
+    write_file(out / "results.md", table(results).encode())
     points = {row["run"]: _shares(row) for row in rows}
     titles = {row["run"]: _title(row) for row in rows}
     write_file(out / "scatter.png", scatter(points, titles))
+
+
+def results_of(rows: Sequence[dict[str, Any]], trials: Trials) -> dict[str, Any]:
+    """Returns the content of ``results.json``."""
+    return {"trials": asdict(trials), "runs": list(rows), "trainings": trainings(rows)}
 
 
 def _shares(row: Mapping[str, Any]) -> tuple[list[Estimate], list[Estimate]]:
@@ -148,52 +253,73 @@ def _shares(row: Mapping[str, Any]) -> tuple[list[Estimate], list[Estimate]]:
 def _title(row: Mapping[str, Any]) -> str:
     if "pearson" not in row:
         return ""
-    value, low, high = (row["pearson"][name] for name in ("value", "low", "high"))
-    if value is None:
-        r = "no variation"
-    else:
-        r = f"r = {value:.2f}"
-    if low is None or high is None:
+    r, bounds = r_text(row["pearson"])
+    if r == ABSENT:
+        r = bounds
         bounds = ""
     else:
-        bounds = f" [{low:.2f}, {high:.2f}]"
+        r = f"r = {r}"
+    if bounds:
+        bounds = f" [{bounds}]"
     return f"{r}{bounds}, MMRV {row['mmrv']:.2f}, bias {row['bias']:+.2f}"
 
 
-def table(rows: Sequence[Mapping[str, Any]]) -> str:
+def r_text(r: Mapping[str, float | None]) -> tuple[str, str]:
+    """Returns a correlation and its interval for a table."""
+    if r["value"] is None:
+        return ABSENT, "no variation"
+    if r["low"] is None or r["high"] is None:
+        return f"{r['value']:.3f}", ""
+    return f"{r['value']:.3f}", f"{r['low']:.2f} … {r['high']:.2f}"
+
+
+def table(results: Mapping[str, Any]) -> str:
     """Returns the results in Markdown: agreement, success, and the judges that decided success."""
+    rows = results["runs"]
     agreements = []
+    middle = []
     for row in rows:
         if "pearson" in row:
-            value, low, high = (row["pearson"][name] for name in ("value", "low", "high"))
-            if value is None:
-                bounds = "no variation"
-            elif low is None or high is None:
-                bounds = ""
-            else:
-                bounds = f"{low:.2f} … {high:.2f}"
-            numbers = [value, *(row[name] for name in NUMBERS)]
-            r, *others = [ABSENT if number is None else f"{number:.3f}" for number in numbers]
+            numbers = [row[name] for name in NUMBERS]
+            others = [ABSENT if number is None else f"{number:.3f}" for number in numbers]
             shares = [f"{100 * row[name]:.0f} %" for name in ("same_outcome", "uninterpretable")]
-            agreements.append([row["run"], r, bounds, *others, f"{row['bias']:+.3f}", *shares])
+            agreements.append([row["run"], *r_text(row["pearson"]), *others, f"{row['bias']:+.3f}", *shares])
+            bias = ABSENT
+            if row["bias_middle"] is not None:
+                bias = f"{row['bias_middle']:+.3f}"
+            middle.append([row["run"], *r_text(row["pearson_inner"]), str(row["inner"]), bias])
+    over = [
+        [", ".join(each["runs"]), str(each["policies"]), *r_text(each["pearson"]), *r_text(each["pearson_inner"])]
+        for each in results["trainings"]
+    ]
     successes = []  # the simulator's are the same for all runs
     for number, row in enumerate(rows):
-        for world in ("simulator", "world_model") if not number else ("world_model",):
-            for name, each in row["policies"].items():
-                share = wilson(sum(each[world]), len(each[world]))
-                place = "the simulator"
-                unclear = ""
-                if world == "world_model":
-                    place = row["run"]
-                    unclear = percent(wilson(sum(each["uninterpretable"]), len(each["uninterpretable"])))
-                clipped = str(each["clipped"][world])
-                successes.append([name, place, percent(share), interval_text(share), unclear, clipped])
+        for name, each in row["policies"].items():
+            if not number:
+                share = wilson(sum(each["simulator"]), len(each["simulator"]))
+                clipped = str(each["clipped"]["simulator"])
+                successes.append([name, "the simulator", percent(share), interval_text(share), "", "", "", "", clipped])
+        for name, each in row["policies"].items():
+            share = wilson(sum(each["world_model"]), len(each["world_model"]))
+            corrected = Estimate(**each["corrected"]["rate"])
+            saved = f"{each['corrected']['worth'] - each['corrected']['trials']:.0f}"
+            unclear = percent(wilson(sum(each["uninterpretable"]), len(each["uninterpretable"])))
+            rates = [percent(share), interval_text(share), percent(corrected), interval_text(corrected), saved]
+            successes.append([name, row["run"], *rates, unclear, str(each["clipped"]["world_model"])])
     lines = [
         as_markdown(Table(AGREEMENT_HEAD, agreements)),
         "",
         FORMULAS,
         "",
+        as_markdown(Table(MIDDLE_HEAD, middle)),
+        "",
+        TRAININGS,
+        "",
+        as_markdown(Table(TRAININGS_HEAD, over)),
+        "",
         as_markdown(Table(SUCCESS_HEAD, successes)),
+        "",
+        CORRECTED,
     ]
     for number, row in enumerate(rows):
         if row["judge"] not in [before["judge"] for before in rows[:number]]:

@@ -20,7 +20,7 @@ from rsjax.progress import Progress
 from rsjax.tools.policies.judges.judge import FAIL, SUCCESS, UNINTERPRETABLE, Judge
 from rsjax.tools.policies.judges.people_and_vlms import SHEET, HumanJudge, LanguageJudge, video_name, write_blinded
 from rsjax.tools.policies.judges.validation import scores, summary
-from rsjax.tools.policies.studies.policy_evaluation import compared, write_results
+from rsjax.tools.policies.studies.policy_evaluation import FIRST_TRAINING, compared, write_results
 from rsjax.tools.policies.studies.trials import Result, Trials
 
 Rollouts = dict[str, list[UInt8[np.ndarray, "T S S 3"]]]  # by policy, one for each episode
@@ -88,7 +88,9 @@ def rejudge(out: Path, judge: Judge, name: str) -> Path:
             )
             for policy, found in labels.items()
         }
-        rows.append(compared(row["run"], true, made) | {"judge": summary({"raw": checked})})
+        training = {name: each.get("training", FIRST_TRAINING) for name, each in row["policies"].items()}
+        judged = {"like": row.get("like", row["run"]), "judge": summary({"raw": checked})}
+        rows.append(compared(row["run"], true, made, training) | judged)
     write_results(folder, rows, Trials(**results["trials"]))
     return folder
 

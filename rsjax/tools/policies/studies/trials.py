@@ -82,14 +82,15 @@ def try_policy(
     trials: Trials,
     folder: Path,
     name: str,
-    save_frames: bool = False,
+    save_frames: int = 0,
 ) -> Result:
     """Runs a policy from each start, except those whose result is in ``folder`` already.
 
     Args:
         folder: the folder of the results, which grow as episodes end, and of a few videos.
         name: for the progress line.
-        save_frames: whether to save the frames of each episode as ``episode-NN.npz``, for other judges.
+        save_frames: of how many episodes, from the first on, to save the frames as ``episode-NN.npz``, for other
+            judges.
 
     Raises:
         UserError: the result in ``folder`` is from other trials, another policy, or another world or judge.
@@ -111,7 +112,7 @@ def try_policy(
                     clipped += episode.clipped
                     if number < trials.videos:
                         write_mp4(folder / f"episode-{number:02d}.mp4", episode.rgb, FPS, 4)
-                    if save_frames:
+                    if number < save_frames:
                         save_arrays(folder / f"episode-{number:02d}.npz", rgb=episode.rgb)
                 work.save(success=success, uninterpretable=uninterpretable, clipped=clipped)
                 progress.update(len(success), success=sum(success))

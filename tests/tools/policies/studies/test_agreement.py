@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rsjax.tools.policies.studies.agreement import agreement, fisher, ranks
+from rsjax.tools.policies.studies.agreement import agreement, correlation, fisher, inner, over_trainings, ranks
 
 RATES = st.lists(st.tuples(st.integers(0, 50), st.integers(0, 50)), min_size=2, max_size=10)
 
@@ -60,3 +60,61 @@ def test_a_wrong_rank_costs_what_lies_between() -> None:
     assert agreement(np.array([0.1, 0.5, 0.9]), np.array([0.2, 0.9, 0.8])).mmrv == pytest.approx((0 + 0.4 + 0.4) / 3)
     with pytest.raises(ValueError, match="the same two policies or more"):
         agreement(np.array([0.1]), np.array([0.2]))
+
+
+TRUE = np.array([0, 0, 0, 26, 30, 50, 60, 74]) / 100
+MADE = np.array([[0, 0, 6, 56, 88, 92, 94, 98], [0, 0, 2, 60, 86, 96, 96, 96]]) / 100  # docs/results/policies.md
+
+
+def test_policies_that_always_fail_carry_the_correlation() -> None:
+    found = agreement(TRUE, MADE[0])
+    assert found.inner == 5 and found.pearson_inner.value == pytest.approx(0.763, abs=1e-3)
+    assert found.pearson.value > 0.92
+    assert found.bias_middle == pytest.approx(0.376) and found.bias == pytest.approx(0.2425)
+    assert inner(np.array([0, 0.02, 1])).tolist() == [False, True, False]
+    ends = agreement(np.array([0.0, 1.0]), np.array([0.0, 1.0]))
+    assert ends.inner == 0 and np.isnan(ends.pearson_inner.value) and np.isnan(ends.bias_middle)
+
+
+def test_an_interval_takes_two_trainings_of_policies() -> None:
+    one = over_trainings(TRUE, MADE, ["a"] * 8)
+    assert one.value == pytest.approx(np.mean([correlation(TRUE, made) for made in MADE]))
+    assert one.low is None and one.high is None
+    two = over_trainings(TRUE, MADE, [*"aaaabbbb"])
+    assert two.low is not None and two.high is not None and two.low < two.value == one.value < two.high
+    perfect = over_trainings(TRUE, TRUE[None], [*"aaaabbbb"])
+    assert perfect.value == pytest.approx(1) and perfect.low is None
+    assert np.isnan(over_trainings(TRUE, 0 * MADE, [*"aaaabbbb"]).value)
+
+
+def test_it_is_a_loop_over_resampled_trainings() -> None:
+    names = np.array([*"abababab"])
+    rng = np.random.default_rng(5)
+    drawn = []
+    for _ in range(4000):
+        policies = np.concatenate([np.flatnonzero(names == name) for name in rng.choice([*"ab"], 2)])
+        drawn.append(np.mean([correlation(TRUE[policies], made[policies]) for made in MADE[rng.integers(2, size=2)]]))
+    error = np.nanstd(np.arctanh(drawn)) * np.sqrt(2)
+    found = over_trainings(TRUE, MADE, names.tolist(), resamples=4000)
+    assert found.low is not None
+    assert (np.arctanh(found.value) - np.arctanh(found.low)) / 12.706 == pytest.approx(error, rel=0.1)
+
+
+@pytest.mark.parametrize("count", [2, 3, 5])
+def test_the_interval_covers_what_many_trainings_give(count: int) -> None:
+    """Trainings differ in how fast their policies learn, and in how kind the model is to them."""
+    rng = np.random.default_rng(count)
+
+    def rates(trainings: int) -> tuple[np.ndarray, np.ndarray]:
+        skill = np.linspace(-4, 2, 8) + rng.normal(0, 0.5, (trainings, 1))
+        seen = skill + 1.5 + rng.normal(0, 0.5, (trainings, 1)) + rng.normal(0, 0.3, (trainings, 8))
+        return tuple(rng.binomial(50, 1 / (1 + np.exp(-each))).ravel() / 50 for each in (skill, seen))  # type: ignore[return-value]
+
+    truth = correlation(*rates(20_000))
+    names = np.repeat(np.arange(count), 8).astype(str).tolist()
+    covered = []
+    for seed in range(400):
+        true, made = rates(count)
+        found = over_trainings(true, made[None], names, seed, resamples=200)
+        covered.append(found.low is not None and found.low <= truth <= found.high)  # type: ignore[operator]
+    assert 0.9 <= np.mean(covered) <= 0.99

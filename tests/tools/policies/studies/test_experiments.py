@@ -91,10 +91,39 @@ def test_a_model_that_moves_alike_ranks_alike(tmp_path: Path) -> None:
     text = squeezed(tmp_path / "results.md")
     assert "R² of y = x is 1 - Σ(y - x)² / Σ(y - ȳ)²" in text
     assert "| true | 1.000 |" in text and "| speed-1.0 | the simulator | 60 % |" in text
+    assert all(each["corrected"]["worth"] == 10 for each in same["policies"].values())  # every trial is paired
     assert (tmp_path / "scatter.png").read_bytes().startswith(b"\x89PNG")
     assert json.loads((tmp_path / "results.json").read_text()) == results
     again = compare(policies, simulated(5), {}, TRIALS, tmp_path)  # nothing is run again
     assert again["runs"] == []
+
+
+def test_more_imagined_trials_than_true_ones_correct_the_rate_by_the_pairs(tmp_path: Path) -> None:
+    policies: Any = {f"speed-{speed}": ToyPolicy(speed) for speed in (0.1, 0.8, 0.9, 1.0)}
+    models: Any = {"true": lambda: imagined(5), "slow": lambda: imagined(5, pace=0.9)}
+    training = {name: name[-1] for name in policies}
+    likes = {"true": "true", "slow": "true"}
+    results = compare(
+        policies, simulated(5), models, TRIALS, tmp_path, imagined=40, training=training, replicates=likes
+    )
+    same, slow = results["runs"]
+    for each in same["policies"].values():
+        assert (len(each["simulator"]), len(each["world_model"])) == (10, 40)
+        assert each["corrected"]["trials"] == 10 and 10 <= each["corrected"]["worth"] < 40
+    fast = same["policies"]["speed-1.0"]
+    assert fast["corrected"]["worth"] > 15 and fast["corrected"]["rate"]["value"] == pytest.approx(0.6)
+    assert same["same_outcome"] == 1 > slow["same_outcome"]
+    for name, each in slow["policies"].items():  # the correction moves the rate towards the true one
+        rates = [np.mean(same["policies"][name]["simulator"]), each["corrected"]["rate"]["value"]]
+        assert abs(rates[1] - rates[0]) <= abs(np.mean(each["world_model"]) - rates[0])
+    (group,) = results["trainings"]
+    assert group["runs"] == ["true", "slow"] and group["policies"] == 4
+    assert group["pearson"]["low"] < group["pearson"]["value"] < group["pearson"]["high"]
+    assert "| true, slow | 4 |" in squeezed(tmp_path / "results.md")
+    assert len(list((tmp_path / "true" / "speed-1.0").glob("episode-*.npz"))) == 10  # those with a true episode
+    with pytest.raises(UserError) as error:
+        compare(policies, simulated(5), models, TRIALS, tmp_path, imagined=9)
+    assert str(error.value) == "--imagined is 9; it must be at least --episodes, which is 10"
 
 
 def test_what_another_judge_model_or_policy_made_is_not_taken_for_ones_own(tmp_path: Path) -> None:
@@ -119,7 +148,8 @@ def test_what_another_judge_model_or_policy_made_is_not_taken_for_ones_own(tmp_p
     text = (tmp_path / "new" / "results.json").read_text()
     assert "NaN" not in text and json.loads(text) == results
     table = squeezed(tmp_path / "new" / "results.md")
-    assert "| run | – | no variation | – |" in table and "| a | run | 0 % | 0 … 28 % | 100 % | 0 |" in table
+    assert "| run | – | no variation | – |" in table
+    assert "| a | run | 0 % | 0 … 28 % | 20 % | 6 … 51 % | 0 | 100 % | 0 |" in table
     assert "The judge has no validation.json" in table
     assert toy_judge.__qualname__ == "judge"  # the keys of functions are their names
 
@@ -129,9 +159,9 @@ def test_checkpoints_go_from_the_first_steps_to_the_last(
 ) -> None:
     stopped: list[int] = []
 
-    def train(config: Any, source: Any, directory: Path, *, name: str, stops: list[int]) -> ToyPolicy:
+    def train(config: Any, source: Any, directory: Path, *, name: str, seed: int, stops: list[int]) -> ToyPolicy:
         stopped.extend(stops)
-        return ToyPolicy(config.train.steps)
+        return ToyPolicy(config.train.steps + seed)
 
     monkeypatch.setattr(comparison, "train_policy", train)
     monkeypatch.setattr(comparison, "load_policy", lambda place: ToyPolicy(float(place.name.removeprefix("at-"))))
@@ -140,6 +170,14 @@ def test_checkpoints_go_from_the_first_steps_to_the_last(
     assert stopped == [10, 30, 60, 120, 250, 500, 750]
     assert [(name, policy.speed) for name, policy in found.items()] == [(f"step-{n}", n) for n in (*stopped, 1000)]
     assert not capsys.readouterr().out
+    trained, training = comparison.trained_policies(config, demos(), tmp_path, 2, trainings=2)
+    assert {name: policy.speed for name, policy in trained.items()} == {  # type: ignore[attr-defined]
+        "step-10": 10,
+        "step-1000": 1000,
+        "seed1-step-10": 10,
+        "seed1-step-1000": 1001,
+    }
+    assert [*training.values()] == ["policy", "policy", "policy-seed1", "policy-seed1"]
     few = comparison.checkpoints(replace(config, train=replace(config.train, steps=20)), demos(), tmp_path, 8)
     assert len(few) == 6
     assert "20 training steps have 6 stages, not 8; more steps, or fewer checkpoints" in capsys.readouterr().out

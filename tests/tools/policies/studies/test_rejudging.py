@@ -20,7 +20,7 @@ def test_a_sheet_of_labels_decides_on_the_rollouts_that_were_kept(tmp_path: Path
     policies: Any = {"slow": ToyPolicy(0.8), "fast": ToyPolicy(1.0)}
     out, trials = tmp_path / "out", Trials(episodes=5, max_steps=4, together=5, videos=1)
     models: Any = {"run": lambda: imagined(5, pace=0.9)}
-    first = compare(policies, simulated(5), models, trials, out)
+    first = compare(policies, simulated(5), models, trials, out, training={"slow": "a", "fast": "b"})
     (tmp_path / "blind").mkdir()  # as an interrupted call leaves it
     sheet = blind(out, tmp_path / "blind")
     with pytest.raises(UserError, match="exists; its labels would be lost"):
