@@ -8,6 +8,7 @@ from rsjax.config.data import ClipShape
 from rsjax.config.fields import loss_weights, require, require_range, runtime, sampling
 from rsjax.config.model import ModelConfig, register_family
 
+ActionEncoder = Literal["linear", "mlp", "norms", "none"]
 SHIFT_PIXELS = 4  # how far the copies of Departures.shifts are moved at most: the side of a token in ``tiny``
 
 
@@ -38,8 +39,9 @@ class PublicCodeConfig:
 class Departures:
     """What the paper does not have. All are off by default; :mod:`rsjax.models.roboscape.departures` implements them.
 
-    Three departures concern sampling alone and so are in :class:`SampleConfig`, off by default too: ``mean_codes``,
-    ``read_means`` and ``guidance``.
+    Others are values of fields that the method has anyway, off by default too: those of sampling in
+    :class:`SampleConfig` (``mean_codes``, ``read_means``, ``guidance``), the keypoint terms in :class:`LossConfig`, and
+    ``model.action_encoder`` "norms".
     """
 
     # Input of the network.
@@ -194,9 +196,11 @@ class LossConfig:
 class TransformerConfig:
     """A spatial-temporal transformer on token grids, with one branch or two."""
 
-    # linear: one linear layer (RoboScape). mlp: an MLP (the paper's Genie with actions), whose last layer starts at
-    # zero, so that public weights keep their logits. none: no actions (the public Genie).
-    action_encoder: Literal["linear", "mlp", "none"] = "linear"
+    # linear: one linear layer, added to the features (RoboScape). mlp: an MLP, added too (the paper's Genie with
+    # actions), whose last layer starts at zero, so that public weights keep their logits. norms: one linear layer, from
+    # which every block's adaptive norms are read (rsjax.models.roboscape.departures.adaptive_norms). none: no actions
+    # (the public Genie).
+    action_encoder: ActionEncoder = "linear"
     width: int = 256  # channels; the size of a model in the paper: 256, 512 or 1024
     blocks: int = 32  # of each branch
     heads: int = 8  # of each attention; more where a head would be wider than 64 channels
@@ -228,6 +232,10 @@ class TransformerConfig:
             self.action_encoder != "none" or not (departures.integrate_actions or departures.action_dropout),
             "model.action_encoder is none, so there are no actions for model.departures.integrate_actions or "
             "model.departures.action_dropout; set them to False and 0",
+        )
+        require(
+            self.action_encoder != "norms" or not self.public.qk_norm,
+            "model.action_encoder is norms, but model.public_code.qk_norm leaves the blocks without norms; change one",
         )
 
     @property
@@ -394,7 +402,7 @@ class GenieConfig(TokenModelConfig):
     With ``action_encoder`` "mlp" it is the paper's baseline, with "none" the public model.
     """
 
-    action_encoder: Literal["linear", "mlp", "none"] = "mlp"
+    action_encoder: ActionEncoder = "mlp"
 
     @property
     def loss_weights(self) -> dict[str, float]:

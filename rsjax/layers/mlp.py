@@ -15,15 +15,21 @@ def mlp(x: Float[Array, "B T S C"], norm: Norm | None, fc1: Linear, fc2: Linear,
         bf16: whether products may round their operands to bf16.
     """
 
-    def feed_forward(x: Array, fc1: Linear, fc2: Linear) -> Array:
-        return dense(gelu(dense(x, *fc1, bf16)), *fc2, bf16)
-
     def layers(x: Array, norm: Norm | None, fc1: Linear, fc2: Linear) -> Array:
         normed = x if norm is None else normalised(x, norm)
-        if bf16:
-            return x + platform.feed_forward(normed, fc1, fc2, feed_forward)
-        return x + feed_forward(normed, fc1, fc2)
+        return x + feed_forward(normed, fc1, fc2, bf16)
 
     if bf16:
         return platform.mlp(x, norm, fc1, fc2, layers)
     return layers(x, norm, fc1, fc2)
+
+
+def feed_forward(x: Float[Array, "B T S C"], fc1: Linear, fc2: Linear, bf16: bool) -> Float[Array, "B T S C"]:
+    """Returns fc2(gelu(fc1(x))), as :func:`mlp` computes it."""
+
+    def layers(x: Array, fc1: Linear, fc2: Linear) -> Array:
+        return dense(gelu(dense(x, *fc1, bf16)), *fc2, bf16)
+
+    if bf16:
+        return platform.feed_forward(x, fc1, fc2, layers)
+    return layers(x, fc1, fc2)

@@ -176,6 +176,7 @@ def test_a_stored_value_of_another_type_is_refused_by_name(path: str, value: Any
         ("model", {"heads": 32, "departures.rotary": True}, "a head has 1 (model.width / model.heads)"),
         ("model", {"action_encoder": "none", "departures.integrate_actions": True}, "model.action_encoder is none"),
         ("model", {"action_encoder": "none", "departures.action_dropout": 0.1}, "model.action_encoder is none"),
+        ("model", {"action_encoder": "norms", "public_code.qk_norm": True}, "qk_norm leaves the blocks without norms"),
         ("model.departures", {"action_dropout": 1.0}, "model.departures.action_dropout is 1.0"),
         ("model.loss", {"num_keypoints": 0}, "model.loss.num_keypoints is 0"),
         ("model.sample", {"steps": 0}, "model.sample.steps is 0"),

@@ -7,6 +7,7 @@ Axes: T frames, S cells of a frame, C width, n vocabularies of V codes.
 """
 
 from rsjax.models.roboscape.architecture import Architecture
+from rsjax.models.roboscape.departures.adaptive_norms import changes
 from rsjax.models.roboscape.departures.motion_head import OUTPUTS
 
 
@@ -43,7 +44,10 @@ def _blocks(sizes: Architecture, frames: int) -> int:
     cells = sizes.grid**2
     linear = 8 * sizes.width**2 + 2 * sizes.public.mlp_ratio * sizes.width**2  # qkv and proj twice, fc1 and fc2
     attention = 2 * (cells + frames) * sizes.width  # scores and weighted sums, over space and over time
-    return sizes.blocks * cells * (linear + attention)
+    adaptive = 0
+    if sizes.action_inputs and sizes.action_encoder == "norms":
+        adaptive = changes(sizes.departures.more_norms) * sizes.width**2
+    return sizes.blocks * (cells * (linear + attention) + adaptive)
 
 
 def _action_encoder(sizes: Architecture) -> int:

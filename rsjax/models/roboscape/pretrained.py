@@ -24,6 +24,7 @@ from rsjax.trainable import Params
 ALIKE = {"read_previous", "whole_frames", "rotary", "more_norms"}
 # Parameters whose outputs are added to the RGB branch's features; and those of a model with a depth head.
 JOINING: tuple[str, ...] = ("blocks/depth_to_rgb/", "action_encoder/", "action_encoder_fc2/", "null_action")
+ADAPTIVE = "/action_norms/"
 HEAD_JOINING = ("depth_embed/", "depth_previous_embed/")
 # Fields that may differ.
 FREE = {"action_encoder", "action_inputs", "motion_head", "departures"} | {
@@ -83,8 +84,9 @@ def start(fresh: Params, saved: Params, directory: Path) -> Params:
     """Returns the parameters that training begins with: the saved ones, unchanged, completed by fresh ones.
 
     What joins the RGB branch begins at zero: the depth → RGB projection or, with a depth head, the embeddings of depth,
-    and the action encoder's last layer. So RGB logits are at first those of the saved model. A saved action encoder is
-    kept; it reads actions normalised for the new data. A saved motion head that this model lacks is left out.
+    and the action encoder's last layer, or what adaptive norms read from it. So RGB logits are at first those of the
+    saved model. A saved action encoder is kept; it reads actions normalised for the new data. A saved motion head that
+    this model lacks is left out.
 
     Raises:
         UserError: this model lacks a saved array, or has it in another shape.
@@ -101,9 +103,12 @@ def start(fresh: Params, saved: Params, directory: Path) -> Params:
     joining = JOINING
     if not any(path.startswith("blocks/depth/") for path in own):
         joining += HEAD_JOINING
+    if any(ADAPTIVE in path for path in own):  # a layer on an encoder of zeros would not learn
+        joining = tuple(prefix for prefix in joining if prefix != "action_encoder/")
     for path, x in own.items():
+        joins = path.startswith(joining) or (path.startswith("blocks/rgb") and ADAPTIVE in path)
         if path not in params:
-            params[path] = jnp.zeros_like(x) if path.startswith(joining) else x
+            params[path] = jnp.zeros_like(x) if joins else x
     return unflatten_dict(params, sep="/")
 
 

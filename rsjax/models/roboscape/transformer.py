@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 from rsjax.layers.attention import KeyValues, attend, packed, put_frames, sees, unpacked
 from rsjax.layers.dense import PRODUCT, Dense, NormParameters, layer_norm
 from rsjax.layers.gelu import gelu
-from rsjax.layers.mlp import mlp
+from rsjax.layers.mlp import feed_forward, mlp
 from rsjax.layers.parameters import Norm
 from rsjax.layers.partition import gathers
 from rsjax.layers.platform import attend_in_clip, attend_over_cache, in_feature_dtype
@@ -28,6 +28,7 @@ from rsjax.layers.unstacked_params import together
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.coarse_cells import merged, split, spread
 from rsjax.models.roboscape.departures.action_dropout import with_null_action
+from rsjax.models.roboscape.departures.adaptive_norms import ActionNorms
 from rsjax.models.roboscape.departures.motion_head import MotionHead
 from rsjax.models.roboscape.departures.norms import optional_norm
 from rsjax.models.roboscape.departures.read_previous import absent_cells, frame_before
@@ -151,25 +152,36 @@ class STBlock(nn.Module):
     """x += Spatial(norm1 x); x += Temporal(x); x += MLP(norm2 x), as in the public Genie.
 
     The departure ``more_norms`` adds a norm before temporal attention; ``public_code.qk_norm`` removes norm1 and norm2.
-    GELU is exact.
+    With ``action_encoder`` "norms" the embedded actions change the norms. GELU is exact.
     """
 
     config: Architecture
 
     @nn.compact
-    def __call__(self, x: Features, start: Any, cache: KeyValues | None) -> tuple[Features, KeyValues | None]:
+    def __call__(
+        self, x: Features, start: Any, cache: KeyValues | None, actions: Float[Array, "B T 1 C"] | None
+    ) -> tuple[Features, KeyValues | None]:
         cfg = self.config
         bf16 = cfg.compute_dtype == "bfloat16"
-        norm = None if cfg.public.qk_norm else NormParameters(name="norm1")(cfg.width)
-        x = x + Attention(cfg, name="spatial_attn").spatial(x, norm)
-        normed = optional_norm(cfg.departures.more_norms, "norm_temporal", x)
-        out, cache = Attention(cfg, name="temporal_attn").temporal(normed, start, cache)
-        x = x + out
-        norm = None if cfg.public.qk_norm else NormParameters(name="norm2")(cfg.width)
+        norm1 = None if cfg.public.qk_norm else NormParameters(name="norm1")(cfg.width)
+        norm2 = None if cfg.public.qk_norm else NormParameters(name="norm2")(cfg.width)
+        spatial = Attention(cfg, name="spatial_attn").spatial
+        temporal = Attention(cfg, name="temporal_attn").temporal
         inner = cfg.public.mlp_ratio * cfg.width
         fc1 = Dense(inner, name="fc1").parameters(cfg.width)
         fc2 = Dense(cfg.width, name="fc2").parameters(inner)
-        return mlp(x, norm, fc1, fc2, bf16), cache
+        if actions is None:
+            x = x + spatial(x, norm1)
+            normed = optional_norm(cfg.departures.more_norms, "norm_temporal", x)
+            out, cache = temporal(normed, start, cache)
+            return mlp(x + out, norm2, fc1, fc2, bf16), cache
+        norm = NormParameters(name="norm_temporal")(cfg.width) if cfg.departures.more_norms else None
+        changes = ActionNorms(cfg.width, cfg.departures.more_norms, bf16, name="action_norms")
+        over_space, over_time, of_mlp = changes(actions)
+        x = x + over_space.after(spatial(over_space.before(x, norm1), None))
+        out, cache = temporal(over_time.before(x, norm), start, cache)
+        x = x + over_time.after(out)
+        return x + of_mlp.after(feed_forward(of_mlp.before(x, norm2), fc1, fc2, bf16)), cache
 
 
 class DualBlock(nn.Module):
@@ -184,14 +196,20 @@ class DualBlock(nn.Module):
 
     @nn.compact
     def __call__(
-        self, x: dict[str, Features], cache: dict[str, KeyValues] | None, start: Any
+        self,
+        x: dict[str, Features],
+        cache: dict[str, KeyValues] | None,
+        start: Any,
+        actions: dict[str, Float[Array, "B T 1 C"] | None],
     ) -> tuple[dict[str, Features], dict[str, KeyValues] | None]:
         cfg = self.config
         out: dict[str, Features] = {}
         new: dict[str, Any] = {}
         for branch, features in x.items():
             branch_cache = None if cache is None else cache[branch]
-            out[branch], new[branch] = STBlock(cfg.sizes(branch), name=branch)(features, start, branch_cache)
+            out[branch], new[branch] = STBlock(cfg.sizes(branch), name=branch)(
+                features, start, branch_cache, actions[branch]
+            )
         if "depth" in out:
             # The gradient of W needs it; recomputing it would be all that the depth block's MLP runs again for.
             out["depth"] = checkpoint_name(out["depth"], DEPTH)
@@ -204,7 +222,7 @@ class DualBlock(nn.Module):
             out["rgb"] = out["rgb"] + joining
         for name in cfg.more_rgb:
             block_cache = None if cache is None else cache[name]
-            out["rgb"], new[name] = STBlock(cfg, name=name)(out["rgb"], start, block_cache)
+            out["rgb"], new[name] = STBlock(cfg, name=name)(out["rgb"], start, block_cache, actions["rgb"])
         return out, None if cache is None else new
 
 
@@ -261,10 +279,15 @@ class Transformer(nn.Module):
         cells = {name: tokens[name].reshape(b, t, cfg.grid**2, *tokens[name].shape[4:]) for name in cfg.modalities}
 
         # Eq. 2: the sum of token, action and position embeddings, by branch.
-        shared = dict.fromkeys(cfg.branches, self._shared(cfg, "", t, start, actions, drop_actions))
+        shared: dict[str, Any] = dict.fromkeys(cfg.branches, self._positions(cfg, "", t, start))
+        encoded: dict[str, Any] = dict.fromkeys(cfg.branches, self._action(cfg, "", actions, drop_actions))
         small = cfg.sizes("depth")
         if "depth" in shared and (small.width, small.grid) != (cfg.width, cfg.grid):
-            shared["depth"] = self._shared(small, "depth_", t, start, actions, drop_actions)
+            shared["depth"] = self._positions(small, "depth_", t, start)
+            encoded["depth"] = self._action(small, "depth_", actions, drop_actions)
+        if cfg.action_inputs and cfg.action_encoder != "norms":
+            shared = {branch: shared[branch] + encoded[branch] for branch in cfg.branches}
+            encoded = dict.fromkeys(cfg.branches)  # the blocks read them no more
         mask = hidden(departures, mask.reshape(b, t, cfg.grid**2), start)
         masks = dict.fromkeys(cfg.modalities, mask)
         if "depth" in masks and no_depth is not None:
@@ -285,12 +308,12 @@ class Transformer(nn.Module):
             _rematerialised(cfg),
             variable_axes={"params": 0},
             split_rngs={"params": True},
-            in_axes=(0, nn.broadcast),
+            in_axes=(0, nn.broadcast, nn.broadcast),
             length=cfg.groups,
             unroll=min(cfg.unroll, cfg.groups),
         )
         new: Any
-        x, new = blocks(cfg, name="blocks")(x, together(cache), start)
+        x, new = blocks(cfg, name="blocks")(x, together(cache), start, encoded)
         self.sow("trunk", "rgb", x["rgb"].astype(jnp.float32))  # for run_with_trunk; nothing otherwise
         if cache is not None:
             cache = put_frames(cache, new, start, departures.rotary)
@@ -304,27 +327,12 @@ class Transformer(nn.Module):
             return x
         return Dense(cfg.width, name=f"{table}_merge")(merged(x, self.config.depth_cells))
 
-    def _shared(
-        self,
-        cfg: Architecture,
-        prefix: str,
-        frames: int,
-        start: Any,
-        actions: Float[Array, "B T A"] | None,
-        drop: Bool[Array, " B"] | None,
-    ) -> Float[Array, "#B T S C"]:
-        """Returns the sum of position and action embeddings of a branch of these sizes.
+    def _positions(self, cfg: Architecture, prefix: str, frames: int, start: Any) -> Float[Array, "T S C"]:
+        """Returns the embeddings of frames and cells, or with rotary positions those of cells alone, (1, S, C).
 
         Args:
             prefix: of the parameters' names.
         """
-        x = self._positions(cfg, prefix, frames, start)
-        if cfg.action_inputs:
-            x = x + self._action(cfg, prefix, actions, drop)
-        return x
-
-    def _positions(self, cfg: Architecture, prefix: str, frames: int, start: Any) -> Float[Array, "T S C"]:
-        """Returns the embeddings of frames and cells, or with rotary positions those of cells alone, (1, S, C)."""
         if not cfg.departures.rotary and frames + (start if isinstance(start, int) else 0) > cfg.frames:
             raise ValueError(f"{frames} frames from {start} on; the model has learned positions for {cfg.frames}")
         learned = 1 if cfg.departures.rotary else cfg.frames
@@ -336,8 +344,10 @@ class Transformer(nn.Module):
 
     def _action(
         self, cfg: Architecture, prefix: str, actions: Float[Array, "B T A"] | None, drop: Bool[Array, " B"] | None
-    ) -> Float[Array, "B T 1 C"]:
-        """Returns the learned action embeddings c = E_a(a), for all cells of a frame."""
+    ) -> Float[Array, "B T 1 C"] | None:
+        """Returns the learned action embeddings c = E_a(a), for all cells of a frame; None without an encoder."""
+        if not cfg.action_inputs:
+            return None
         if actions is None:
             raise ValueError(f"the model reads actions ({cfg.action_inputs} numbers a frame), and got none")
         if cfg.action_encoder == "mlp":

@@ -107,7 +107,7 @@ def bandwidth(budget: float) -> float:
 
 
 def operations(arch: Architecture, config: Config, batch: int) -> tuple[Operation, ...]:
-    """Returns the operations of a training step's forward pass, without rematerialisation and without embeddings."""
+    """Returns the operations of a training step's forward pass, without rematerialisation, embeddings and actions."""
     frames = config.clips.frames
     found: dict[str, Operation] = {}
     for modality in arch.modalities:

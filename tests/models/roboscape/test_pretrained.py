@@ -63,8 +63,9 @@ def public(tmp_path_factory: pytest.TempPathFactory) -> Path:
         {"public_code": BOTH},
         {"compute_dtype": "bfloat16"},
         {"action_encoder": "mlp"},
+        {"action_encoder": "norms"},
     ],
-    ids=["plain", "qk-norm and muP", "bfloat16", "MLP of actions"],
+    ids=["plain", "qk-norm and muP", "bfloat16", "MLP of actions", "adaptive norms"],
 )
 @pytest.mark.parametrize("depth", ["branch", "small branch", "head"])
 def test_a_model_with_depth_begins_with_the_very_logits_of_the_genie_it_starts_from(
@@ -82,7 +83,8 @@ def test_a_model_with_depth_begins_with_the_very_logits_of_the_genie_it_starts_f
     fresh = random_params(dual, seed=1)
     begun = begin(dual, tmp_path, fresh)
     expected = rgb_logits(alone, params)
-    tolerance = 1e-4 * (depth == "small branch")  # its program sums in another order
+    other_order = depth == "small branch" or "norms" in options.values()  # in which its program sums
+    tolerance = 1e-4 * other_order
     np.testing.assert_allclose(rgb_logits(dual, begun), expected, rtol=tolerance, atol=tolerance)
     assert expected.std() > 0.1
     assert jax.tree.map(jnp.shape, begun) == jax.tree.map(jnp.shape, fresh)

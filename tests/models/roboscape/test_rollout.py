@@ -18,6 +18,7 @@ from tests.models.roboscape.toy_sample import BATCH, DUAL, HEAD, KEY, NO_PARAMS,
 
 SMALL = replace(DUAL, depth_width=8, depth_blocks=1, depth_cells=3)
 WHOLE = depart(DUAL, read_previous=True, whole_frames=True)
+ADAPTIVE = replace(depart(DUAL, more_norms=True), action_encoder="norms")
 
 
 @pytest.mark.parametrize(
@@ -30,8 +31,20 @@ WHOLE = depart(DUAL, read_previous=True, whole_frames=True)
         (WHOLE, 3, SampleConfig(steps=2, temperature=1.0)),
         (SMALL, 1, SampleConfig(steps=2)),
         (depart(HEAD, read_previous=True), 3, SampleConfig(steps=4, unmask="greedy")),
+        (ADAPTIVE, 1, SampleConfig(steps=2)),
+        (replace(ADAPTIVE, depth="none"), 3, SampleConfig(steps=2, temperature=1.0)),
     ],
-    ids=["dual-random", "dual-greedy", "rgb-warm", "previous", "whole-warm", "small", "head-greedy"],
+    ids=[
+        "dual-random",
+        "dual-greedy",
+        "rgb-warm",
+        "previous",
+        "whole-warm",
+        "small",
+        "head-greedy",
+        "adaptive",
+        "adaptive-rgb-warm",
+    ],
 )
 def test_cached_is_uncached(model: Architecture, prompt: int, sample: SampleConfig) -> None:
     params, (tokens, actions) = random_params(model), given(model, prompt)

@@ -9,6 +9,7 @@ import pytest
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.transformer import Transformer, empty_cache
 from tests.models.roboscape.toy import (
+    ADAPTIVE,
     BATCH,
     COARSE,
     DUAL,
@@ -36,7 +37,13 @@ CONFIGS = {"dual": DUAL, "rgb": RGB, "normed": NORMED, "qk-norm": QK_NORM, "prev
 CONFIGS |= {"whole-frames": WHOLE, "head": HEAD, "head-previous": replace(READS_PREVIOUS, depth="head")}
 SMALLER = {"narrow": NARROW, "shallow": SHALLOW, "coarse": COARSE, "small": SMALL}
 CONFIGS |= SMALLER
+CONFIGS |= {"adaptive": ADAPTIVE, "adaptive-head": replace(HEAD, action_encoder="norms")}
+CONFIGS |= {
+    "adaptive-rgb": replace(RGB, action_encoder="norms"),
+    "adaptive-small": replace(SMALL, action_encoder="norms"),
+}
 PIECED = {"dual": DUAL, "qk-norm": QK_NORM, "head": HEAD, "small": replace(SMALL, departures=DUAL.departures)}
+PIECED |= {"adaptive": ADAPTIVE}
 
 
 @pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS)
@@ -77,13 +84,15 @@ def test_without_an_action_encoder_actions_are_not_read() -> None:
         np.testing.assert_array_equal(forward(GENIE, params, (tokens, mask, other))["rgb"], expected)
 
 
-def test_a_dropped_clip_sees_the_null_action_in_every_frame_and_the_others_their_own() -> None:
-    params, (tokens, mask, actions) = random_params(GUIDED), random_inputs(GUIDED)
+@pytest.mark.parametrize("way", ["linear", "norms"])
+def test_a_dropped_clip_sees_the_null_action_in_every_frame_and_the_others_their_own(way: Any) -> None:
+    guided = replace(GUIDED, action_encoder=way)
+    params, (tokens, mask, actions) = random_params(guided), random_inputs(guided)
     drop = np.array([True, False])
-    dropped, _ = apply(GUIDED, params, tokens, mask, actions, 0, None, drop)
-    own = forward(GUIDED, params, (tokens, mask, actions))
+    dropped, _ = apply(guided, params, tokens, mask, actions, 0, None, drop)
+    own = forward(guided, params, (tokens, mask, actions))
     null = dict(params, action_encoder={"kernel": np.zeros((3, 8), np.float32), "bias": params["null_action"]})
-    without = forward(GUIDED, null, (tokens, mask, actions))
+    without = forward(guided, null, (tokens, mask, actions))
     for name in own:
         np.testing.assert_allclose(dropped[name][0], without[name][0], rtol=1e-4, atol=1e-4)
         np.testing.assert_allclose(dropped[name][1], own[name][1], rtol=1e-4, atol=1e-4)
@@ -112,6 +121,17 @@ def test_hiding_depth_leaves_the_callers_mask_and_a_model_without_depth_as_they_
     params, inputs = random_params(RGB), random_inputs(RGB)
     alone, _ = apply(RGB, params, *inputs, no_depth=np.ones(BATCH, bool))
     np.testing.assert_array_equal(alone["rgb"], forward(RGB, params, inputs)["rgb"])
+
+
+def test_adaptive_norms_begin_as_the_network_without_actions() -> None:
+    params, (tokens, mask, actions) = jax.jit(Transformer(ADAPTIVE).init_params)(jax.random.key(0)), random_inputs(DUAL)
+    plain = {"blocks": jax.tree.map(np.asarray, params["blocks"])}
+    for branch in ADAPTIVE.branches:
+        del plain["blocks"][branch]["action_norms"]
+    without = replace(NORMED, action_encoder="none", action_inputs=0)
+    expected = forward(without, params | plain, (tokens, mask, None))
+    for name, logits in forward(ADAPTIVE, params, (tokens, mask, actions)).items():
+        np.testing.assert_allclose(logits, expected[name], rtol=1e-5, atol=1e-6)
 
 
 def test_actions_cannot_be_dropped_without_a_null_action() -> None:
@@ -194,13 +214,14 @@ def test_every_cell_reads_every_cell_of_its_own_and_earlier_frames() -> None:
             assert np.all(change[2:] > 1e-6)
 
 
-def test_an_action_reaches_the_frame_that_it_led_into() -> None:
-    params, (tokens, mask, actions) = random_params(DUAL), random_inputs(DUAL)
+@pytest.mark.parametrize("config", [DUAL, ADAPTIVE], ids=["added", "adaptive"])
+def test_an_action_reaches_the_frame_that_it_led_into(config: Architecture) -> None:
+    params, (tokens, mask, actions) = random_params(config), random_inputs(config)
     other = actions.copy()
     other[:, 3] += 1
     change = {
-        name: np.abs(x - forward(DUAL, params, (tokens, mask, other))[name]).max(axis=(0, 2, 3, 4))
-        for name, x in forward(DUAL, params, (tokens, mask, actions)).items()
+        name: np.abs(x - forward(config, params, (tokens, mask, other))[name]).max(axis=(0, 2, 3, 4))
+        for name, x in forward(config, params, (tokens, mask, actions)).items()
     }
     for x in change.values():
         np.testing.assert_array_equal(x > 0, [False, False, False, True, True])

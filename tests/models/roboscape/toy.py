@@ -32,6 +32,7 @@ WHOLE = depart(READS_PREVIOUS, whole_frames=True)
 SMALL = replace(READS_PREVIOUS, blocks=4, grid=4, depth_width=4, depth_blocks=2, depth_cells=2)
 GENIE = replace(RGB, action_encoder="none", action_inputs=0)
 GUIDED = depart(DUAL, action_dropout=0.5)
+ADAPTIVE = replace(NORMED, action_encoder="norms")
 BATCH = 2
 
 
@@ -126,18 +127,33 @@ def sequence_attention(x: np.ndarray, p: dict, config: Architecture, causal: boo
     return out.reshape(length, width) @ p["proj"]["kernel"] + p["proj"]["bias"]
 
 
-def st_block(x: np.ndarray, p: dict, config: Architecture) -> np.ndarray:
+def st_block(x: np.ndarray, p: dict, config: Architecture, action: np.ndarray | None) -> np.ndarray:
+    """A block; ``action`` (B, T, 1, C) is None unless the norms are read from it."""
     x = x.copy()
     b, t, s, _ = x.shape
-    normed = x.copy() if config.public.qk_norm else layer_norm(x, p["norm1"])
-    x += [[sequence_attention(normed[i, j], p["spatial_attn"], config, False) for j in range(t)] for i in range(b)]
-    before = layer_norm(x, p["norm_temporal"]) if config.departures.more_norms else x.copy()
+    changes = np.zeros((9, b, t, 1, 1))  # gate, scale and shift over space, of the MLP and over time
+    if action is not None:
+        linear = p["action_norms"]["linear"]
+        read = (action / (1 + np.exp(-action))) @ linear["kernel"] + linear["bias"]
+        changes = np.zeros((9, *x.shape[:2], 1, x.shape[3]))
+        parts = np.split(read, read.shape[-1] // x.shape[3], axis=-1)
+        changes[: len(parts)] = parts
+    gates = 1 + changes[[0, 6, 3]]
+    scales = 1 + changes[[1, 7, 4]]
+    shifts = changes[[2, 8, 5]]
+    normed = x.copy() if config.public.qk_norm else layer_norm(x, p["norm1"]) * scales[0] + shifts[0]
+    out = [[sequence_attention(normed[i, j], p["spatial_attn"], config, False) for j in range(t)] for i in range(b)]
+    x += gates[0] * np.array(out)
+    before = x.copy()
+    if config.departures.more_norms:
+        before = layer_norm(x, p["norm_temporal"]) * scales[1] + shifts[1]
     for i in range(b):
         for cell in range(s):
-            x[i, :, cell] += sequence_attention(before[i, :, cell], p["temporal_attn"], config, True)
-    normed = x if config.public.qk_norm else layer_norm(x, p["norm2"])
+            passed = sequence_attention(before[i, :, cell], p["temporal_attn"], config, True)
+            x[i, :, cell] += gates[1][i, :, 0] * passed
+    normed = x if config.public.qk_norm else layer_norm(x, p["norm2"]) * scales[2] + shifts[2]
     hidden = gelu(normed @ p["fc1"]["kernel"] + p["fc1"]["bias"])
-    return x + hidden @ p["fc2"]["kernel"] + p["fc2"]["bias"]
+    return x + gates[2] * (hidden @ p["fc2"]["kernel"] + p["fc2"]["bias"])
 
 
 def embed(tokens: np.ndarray, mask: np.ndarray, p: dict, config: Architecture) -> np.ndarray:
@@ -157,6 +173,7 @@ def plain_forward(config: Architecture, params: Any, inputs: tuple) -> dict[str,
         mask = mask.copy()
         mask[:, 1:] = True
     h = {}
+    conditions: dict[str, Any] = {}
     for name, grid in tokens.items():
         flat = grid.reshape(b, t, -1)
         x = merge(embed(flat, mask.reshape(b, t, -1), p[f"{name}_embed"], config), name, "embed", p, config)
@@ -170,15 +187,20 @@ def plain_forward(config: Architecture, params: Any, inputs: tuple) -> dict[str,
             h[name] = h[name] + p[f"{prefix}pos_embed"][:t]
         if name in config.branches and config.action_inputs:
             encoder = p[f"{prefix}action_encoder"]
-            h[name] += (actions @ encoder["kernel"] + encoder["bias"])[:, :, None]
+            encoded = (actions @ encoder["kernel"] + encoder["bias"])[:, :, None]
+            if config.action_encoder == "norms":
+                conditions[name] = encoded
+            else:
+                h[name] += encoded
     if config.depth == "head":
         h = {"rgb": h["rgb"] + h["depth"]}
     for block in range(config.blocks):
         group, place = divmod(block, config.blocks // config.groups)
         own = jax.tree.map(lambda x, group=group: x[group], p["blocks"])
-        h["rgb"] = st_block(h["rgb"], own["rgb" if place == 0 else f"rgb_{place}"], config)
+        parameters = own["rgb" if place == 0 else f"rgb_{place}"]
+        h["rgb"] = st_block(h["rgb"], parameters, config, conditions.get("rgb"))
         if config.depth == "branch" and place == 0:
-            h["depth"] = st_block(h["depth"], own["depth"], config.sizes("depth"))
+            h["depth"] = st_block(h["depth"], own["depth"], config.sizes("depth"), conditions.get("depth"))
             joining = h["depth"] @ own["depth_to_rgb"]["kernel"] + own["depth_to_rgb"]["bias"]
             h["rgb"] = h["rgb"] + joining[:, :, coarse_cell(config)]
     if config.depth == "head":
