@@ -143,6 +143,11 @@ class TokenizerTrainConfig(TrainConfig):
         require_range(self, "tokenizer_train", 0, math.inf, "entropy_group")
         require_range(self, "tokenizer_train", 1, math.inf, "frames_per_clip")
         require_range(self, "tokenizer_train", 0, 1, "depth_share")
+        require(
+            all(part.annotations == "own" for stage in self.curriculum for part in stage.components),
+            "tokenizer_train.curriculum has estimated annotations, which only a world model can learn from; write them "
+            "into train.curriculum",
+        )
         images = self.batch_size // self.accumulate * self.frames_per_clip
         require(
             self.entropy_group == 0 or images % self.entropy_group == 0,

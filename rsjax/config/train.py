@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass, fields
 from typing import ClassVar, Literal
 
-from rsjax.config.fields import require, require_range, runtime
+from rsjax.config.fields import later, require, require_range, runtime
 
 
 @dataclass(frozen=True)
@@ -82,8 +82,16 @@ class ComponentConfig:
     store: str = ""  # a token store of the same tokenizer; empty: this run's own
     weight: float = 1.0  # share of the clips drawn, relative to the other components
     clips: int = 0  # use only this many of these clips, the first ones; 0: all
+    # Depth and tracks to learn from: own, the clips' own; or for the world model on this run's own clips, tracks by
+    # Lucas–Kanade, depth by a network trained on other clips, or both (rsjax.tools.pipeline.estimated_annotations).
+    annotations: Literal["own", "estimated_tracks", "estimated_depth", "estimated"] = later("own")
 
     def __post_init__(self) -> None:
+        require(
+            self.annotations == "own" or not self.store,
+            f"a component of a data mixture has annotations {self.annotations} and a store; annotations are estimated "
+            f"for the run's own clips alone, so leave one of them out",
+        )
         require(self.weight > 0, f"a component of a data mixture has weight {self.weight}; it must be above 0")
         require(self.clips >= 0, f"a component of a data mixture has {self.clips} clips; 0 means all of them")
 

@@ -130,6 +130,7 @@ def choose(part: ComponentConfig, store: Store) -> np.ndarray | None:
 def _resolve(stage: CurriculumStageConfig, batch_size: int, own: Store, transform: Transform) -> CurriculumStage:
     components = []
     for config in stage.components:
+        assert config.annotations == "own", "the pipeline names the store that has the estimates"
         store = open_store(config.store) if config.store else own
         component = MixtureComponent(store.source(SPLIT), transform, choose(config, store), config.weight)
         if not len(component):

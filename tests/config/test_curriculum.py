@@ -107,6 +107,7 @@ def test_full_size_presets_have_the_authors_curriculum_and_it_can_be_dropped() -
         ([{"components": []}], "a curriculum's stage has no components"),
         ([{"components": [{}], "tasks": ["a"]}], "tasks stand beside components"),
         ([{"components": 3}], "CurriculumStageConfig.components must be a list"),
+        ([{"annotations": "estimated", "store": "elsewhere"}], "annotations estimated and a store"),
         ([{"tasks": "pick"}], "ComponentConfig.tasks must be a list; it is 'pick'"),
         ([{"weight": -1}], "a component of a data mixture has weight -1"),
         ([{"clips": -1}], "a component of a data mixture has -1 clips"),

@@ -18,15 +18,20 @@ _WEIGHTS = "weights"
 
 
 def check_depth(run: Run) -> None:
-    """Raises :class:`StoreError` if the estimator is to learn from a store whose clips have no depth in metres."""
-    if not run.config.eval.simulator_steps or run.config.data is None:
+    """Raises :class:`StoreError` if a network is to learn depth from a store whose clips have none in metres."""
+    if run.config.data is None:
         return
     manifest = run.open_clips().manifest
-    if not manifest.get("depth_range") or (manifest.get("depth_unit") or "metres") != "metres":
+    if manifest.get("depth_range") and (manifest.get("depth_unit") or "metres") == "metres":
+        return
+    where = f"{run.clips}: its clips have no depth in metres, from which"
+    if run.config.eval.simulator_steps:
         raise StoreError(
-            f"{run.clips}: its clips have no depth in metres, from which the depth estimator {SIMULATOR} would learn; "
-            f"name another --eval.depth-estimator, or none"
+            f"{where} the depth estimator {SIMULATOR} would learn; name another --eval.depth-estimator, or none"
         )
+    parts = [part for stage in run.config.train.curriculum for part in stage.components]
+    if any(part.annotations in ("estimated_depth", "estimated") for part in parts):
+        raise StoreError(f"{where} it could be estimated; train with annotations own or estimated_tracks")
 
 
 def make_depth_network(run: Run) -> None:

@@ -16,6 +16,7 @@ from rsjax.models.base import Assets, create_autoencoder, create_model
 from rsjax.models.load_run import load_tokenizer
 from rsjax.progress import Progress, duration, note, stage
 from rsjax.tools.pipeline.depth_stage import check_depth, make_depth_network
+from rsjax.tools.pipeline.estimated_annotations import with_estimates
 from rsjax.tools.pipeline.evaluations import evaluate_own
 from rsjax.tools.pipeline.limits import check_batch, check_episodes
 from rsjax.tools.pipeline.metric_files import check_metric_files
@@ -239,7 +240,7 @@ def world_model_loader(run: Run) -> LoaderFactory:
         StoreError: the prepared store is missing, or the curriculum of ``train`` does not fit it.
     """
     prepared = run.open_prepared()
-    loop = run.config.loop("world_model")
+    loop = with_estimates(run, run.config.loop("world_model"))
     ours = _depth_range(prepared)
     for store in check_stages(loop, prepared):
         theirs = _depth_range(store)

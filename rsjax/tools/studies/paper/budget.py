@@ -14,9 +14,11 @@ import jax
 
 from rsjax.config import SIMULATOR, Config, TokenizerConfig, TokenModelConfig, TrainConfig, require
 from rsjax.config.config_fields import with_values
+from rsjax.evaluation.depth_network import BATCH
 from rsjax.models.base import create_autoencoder, create_model
 from rsjax.tokenizers.autoencoder import Autoencoder
 from rsjax.tokenizers.flops import tokenizer_flops
+from rsjax.tools.pipeline.estimated_annotations import CLIPS, PASSES
 
 EPISODE = 0.41  # seconds to simulate an episode
 TOKENS = 1 / 26  # seconds to make the tokens of a clip or of a moved copy of it
@@ -35,6 +37,7 @@ EVALUATION = 30.0  # seconds per evaluation
 LOCALISER = 0.106  # seconds per step of the localiser
 # Seconds per step of the depth estimator that learns from the clips, for frames of 64 pixels: 0.126 of processor time.
 DEPTH_STEP = 0.08
+FOLLOW = 0.014  # seconds of processor time to follow the points of a clip of 64 pixels by Lucas–Kanade
 ROLLOUT = 0.18  # seconds per rollout
 
 COLLECT_SHARE = 0.06  # shares of a budget
@@ -195,6 +198,19 @@ def depth_estimator_seconds(config: Config) -> float:
     """Returns the seconds of training the depth estimator; 0 if none learns from the clips."""
     steps = config.eval.simulator_steps
     return START + steps * _depth_step_seconds(config) if steps else 0.0
+
+
+def annotation_seconds(config: Config) -> float:
+    """Returns the seconds of estimating training clips' depth and tracks, and of making tokens; 0 if none are read."""
+    wanted = {part.annotations for stage in config.train.curriculum for part in stage.components} - {"own"}
+    clips = config.sim.episodes - config.sim.test_episodes
+    seconds = TOKENS * config.sim.episodes * (1 + sum(config.model.token_shifts[:1])) * len(wanted)
+    if wanted & {"estimated_depth", "estimated"}:
+        steps = PASSES * min(clips, 2 * CLIPS) * config.clips.frames / BATCH  # of both halves' networks
+        seconds += 2 * START + steps * _depth_step_seconds(config)
+    if wanted & {"estimated_tracks", "estimated"}:
+        seconds += FOLLOW * clips
+    return seconds
 
 
 def _depth_step_seconds(config: Config) -> float:

@@ -43,6 +43,8 @@ class Arm:
         curriculum: the epochs of its training on each difficulty, in order; they are scaled to the cell's steps.
         mixed: mix the clips of these stages instead, each clip as often as in the curriculum.
         data: the share of the training clips that the world model learns from.
+        annotations: the depth and tracks that the world model learns from
+            (:attr:`rsjax.config.ComponentConfig.annotations`).
         rate: a factor on the learning rate of the world model.
         published: the paper's numbers for this arm, by metric.
     """
@@ -55,6 +57,7 @@ class Arm:
     curriculum: Mapping[str, float] = field(default_factory=dict)
     mixed: bool = False
     data: float = 1.0
+    annotations: Literal["own", "estimated_tracks", "estimated_depth", "estimated"] = "own"
     rate: float = 1.0
     published: Mapping[str, float] = field(default_factory=dict)
 

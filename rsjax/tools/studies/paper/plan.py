@@ -126,7 +126,11 @@ def _new_seconds(config: Config, keys: Mapping[str, str], made: set[str]) -> flo
         "tokenizer": budget.tokenizer_seconds,
         "world_model": budget.model_seconds,
         "depth_estimator": budget.depth_estimator_seconds,
+        "annotations": budget.annotation_seconds,
     }
+    # Copies with estimated annotations are no stage; all world models on them share them.
+    copies = [part.annotations for stage in config.train.curriculum for part in stage.components]
+    keys = {**keys, "annotations": " ".join([keys["tokens"], *copies])}
     new = [stage for stage in parts if stage in keys and keys[stage] not in made]
     made.update(keys[stage] for stage in new)
     return sum(parts[stage](config) for stage in new)
@@ -153,7 +157,8 @@ def _label(arm: Arm) -> dict[str, Value]:
         order = "+".join(f"{name} {epochs:g}" for name, epochs in arm.curriculum.items())
         stages["curriculum"] = order + " mixed" * arm.mixed
     shares = {name: f"{share:.2g}" for name, share in (("data", arm.data), ("rate", arm.rate)) if share != 1}
-    return {**family, **arm.values, **stages, **shares}
+    estimates = {"annotations": arm.annotations} if arm.annotations != "own" else {}
+    return {**family, **arm.values, **stages, **shares, **estimates}
 
 
 def arm_config(arm: Arm, scale: Scale, seed: int, vary: Vary = "model") -> Config:
@@ -209,6 +214,8 @@ def _stages(arm: Arm, config: Config) -> tuple[CurriculumStageConfig, ...]:
     """Returns the stages of an arm's training, for about as many steps as the configuration has."""
     clips = config.sim.episodes - config.sim.test_episodes
     drawn = config.train.steps * config.train.batch_size
+    if arm.annotations != "own":
+        return (CurriculumStageConfig((ComponentConfig(annotations=arm.annotations),), drawn / clips),)
     if arm.data < 1:
         some = max(1, round(arm.data * clips))
         return (CurriculumStageConfig((ComponentConfig(clips=some),), drawn / some),)

@@ -174,6 +174,17 @@ def test_a_share_of_the_data_is_read_for_as_many_steps(three_hours: Plan) -> Non
     assert stage.epochs * stage.components[0].clips == pytest.approx(base.train.steps * base.train.batch_size)
 
 
+def test_estimated_annotations_are_read_for_as_many_steps_and_cost_their_time(three_hours: Plan) -> None:
+    base = three_hours.scale.base
+    for words in ("estimated_tracks", "estimated_depth", "estimated"):
+        config = arm_config(Arm("", annotations=words), three_hours.scale, 0)  # type: ignore[arg-type]
+        (stage,) = config.train.curriculum
+        clips = base.sim.episodes - base.sim.test_episodes
+        assert stage.epochs * clips == pytest.approx(base.train.steps * base.train.batch_size)
+        assert Run(config, DATA, DATA).keys()["tokens"] == Run(base, DATA, DATA).keys()["tokens"]
+        assert budget.annotation_seconds(config) > budget.annotation_seconds(base) == 0
+
+
 @pytest.mark.parametrize("name", ["ivideogpt", "irasim", "cogvideox"])
 def test_a_family_has_the_base_presets_clips_and_as_many_seconds_or_operations(name: str) -> None:
     at = scale(TINY, HOUR)
