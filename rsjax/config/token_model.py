@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 from rsjax.config.data import ClipShape
-from rsjax.config.fields import loss_weights, require, require_range, runtime, sampling
+from rsjax.config.fields import later, loss_weights, require, require_range, runtime, sampling
 from rsjax.config.model import ModelConfig, register_family
 
 ActionEncoder = Literal["linear", "mlp", "norms", "none"]
@@ -331,6 +331,9 @@ class DepthHead:
     """
 
     kind: ClassVar[Literal["head"]] = "head"
+    # Whether the network reads depth tokens, true ones in training and its own in generation. False: it reads RGB's
+    # alone, and generation without depth leaves the head out, which changes no token of RGB.
+    feed_back: bool = later(True)
 
 
 @dataclass(frozen=True)

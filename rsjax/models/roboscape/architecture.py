@@ -5,6 +5,7 @@ from typing import Literal
 
 from rsjax.config import (
     Config,
+    DepthHead,
     RoboScapeConfig,
     SampleConfig,
     SmallDepthBranch,
@@ -27,6 +28,7 @@ class Architecture(TransformerConfig):
         action_inputs: numbers per frame that the action encoder reads; 0: no encoder.
         depth: how the network uses depth: in a branch of its own (Eq. 2 and 3), by a second head on the RGB branch, or
             not at all.
+        reads_depth: whether a network with a second head reads depth tokens.
         depth_width: channels of the depth branch; 0: as many as RGB's.
         depth_blocks: blocks of the depth branch; 0: as many as RGB's.
         depth_cells: token cells along each side of one of the depth branch's cells.
@@ -42,6 +44,7 @@ class Architecture(TransformerConfig):
     vocabularies: int = 2
     action_inputs: int = 28
     depth: Literal["branch", "head", "none"] = "branch"
+    reads_depth: bool = True
     depth_width: int = 0
     depth_blocks: int = 0
     depth_cells: int = 1
@@ -63,7 +66,10 @@ class Architecture(TransformerConfig):
         assert isinstance(model, TokenModelConfig)
         depth: Literal["branch", "head", "none"] = "none"
         small = SmallDepthBranch()
+        reads_depth = True
         if isinstance(model, RoboScapeConfig):
+            if isinstance(model.depth, DepthHead):
+                reads_depth = model.depth.feed_back
             if isinstance(model.depth, SmallDepthBranch):
                 depth = "branch"
                 small = model.depth
@@ -80,6 +86,7 @@ class Architecture(TransformerConfig):
             vocabularies=config.tokenizer.vocabularies,
             action_inputs=inputs,
             depth=depth,
+            reads_depth=reads_depth,
             depth_width=small.width,
             depth_blocks=small.blocks,
             depth_cells=small.cells,
@@ -93,10 +100,17 @@ class Architecture(TransformerConfig):
 
     @property
     def modalities(self) -> tuple[str, ...]:
-        """Names of what the network reads and predicts."""
+        """Names of what the network predicts."""
         if self.depth == "none":
             return ("rgb",)
         return ("rgb", "depth")
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Names of the modalities whose tokens the network reads."""
+        if self.depth == "head" and not self.reads_depth:
+            return ("rgb",)
+        return self.modalities
 
     @property
     def branches(self) -> tuple[str, ...]:
@@ -139,6 +153,18 @@ class Architecture(TransformerConfig):
         ``whole_frames`` the pass over a frame's masked cells is final.
         """
         return 0 if self.departures.whole_frames else 1
+
+    def generating(self, sample: SampleConfig, depth: bool) -> "Architecture":
+        """Returns the network that generates: without its depth head if the same RGB is generated without it.
+
+        That is so if it does not read depth tokens, and the confidence in them does not order the cells.
+
+        Args:
+            depth: whether depth is wanted.
+        """
+        if depth or "depth" in self.inputs or sample.unmask == "greedy":
+            return self
+        return replace(self, depth="none")
 
     def check_sampling(self, sample: SampleConfig) -> None:
         """Raises :class:`rsjax.config.ConfigError` if the network does not support these settings."""

@@ -119,7 +119,8 @@ def _unmask_clip(
     no_depth: Array | None,
     temperature: float | Array | None,
 ) -> Frame:
-    order_key, *branch_keys = jax.random.split(key, len(logits) + 1)
+    order_key, rgb_key, depth_key = jax.random.split(key, 3)
+    branch_keys = {"rgb": rgb_key, "depth": depth_key}  # RGB's draws are the same where depth is left out
     tokens = {}
     confidence = jnp.zeros(frame.mask.shape)
     entropy = frame.entropy
@@ -127,8 +128,8 @@ def _unmask_clip(
         temperature = config.temperature
     if entropy is not None:
         entropy = jnp.where(frame.mask, token_entropy(logits["rgb"]), entropy)
-    for branch_key, (branch, branch_logits) in zip(branch_keys, logits.items(), strict=True):
-        drawn, log_p = sample_tokens(branch_key, branch_logits, temperature, code_bits, config.top_k)
+    for branch, branch_logits in logits.items():
+        drawn, log_p = sample_tokens(branch_keys[branch], branch_logits, temperature, code_bits, config.top_k)
         tokens[branch] = jnp.where(frame.mask, drawn, frame.tokens[branch])
         if branch == "depth" and no_depth is not None:
             log_p = jnp.where(no_depth, 0.0, log_p)

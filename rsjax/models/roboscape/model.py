@@ -98,7 +98,8 @@ class RoboScape(WorldModel[Batch]):
             fixed = jax.lax.stop_gradient(params)
             on = conditions_itself(departures, key, context.step)
             first_pass = partial(run_transformer, arch, fixed, *inputs, **options)
-            previous = previous_frames(first_pass, corrupted.tokens, arch.code_bits, on, self.prompt_frames)
+            read = {name: corrupted.tokens[name] for name in arch.inputs}
+            previous = previous_frames(first_pass, read, arch.code_bits, on, self.prompt_frames)
         trunk = None
         motion: Any = None
         if self.config.keypoint_term in ("motion", "feature"):
@@ -137,9 +138,9 @@ class RoboScape(WorldModel[Batch]):
         depth: bool = True,
     ) -> Video:
         """Encodes the prompt, rolls out tokens and decodes them. T may exceed the trained positions."""
-        arch = self.architecture
         sample = self.config.sample
-        tokens, has_depth = self._tokens(assets, prompt)
+        arch = self.architecture.generating(sample, depth)
+        tokens, has_depth = self._tokens(assets, prompt, arch)
         tokens, inputs = divide((tokens, self._action_inputs(assets, actions)), params)
         key = jax.random.key(sample.seed)
         made = rollout(arch, sample, params, tokens, inputs, key, index=index, no_depth=~has_depth)
@@ -159,13 +160,13 @@ class RoboScape(WorldModel[Batch]):
         Raises:
             ValueError: the candidates' actions into the prompt's frames differ.
         """
-        arch = self.architecture
         sample = self.config.sample
+        arch = self.architecture.generating(sample, depth)
         candidates = len(actions)
         past = prompt.rgb.shape[1]
         if np.any(actions[:, 1:past] != actions[:1, 1:past]):
             raise ValueError(f"the candidates' actions differ in rows before {past}, which led into the one prompt")
-        tokens, has_depth = self._tokens(assets, prompt)
+        tokens, has_depth = self._tokens(assets, prompt, arch)
         inputs = self._action_inputs(assets, actions)
         encoded = encode_prompt(arch, sample, params, tokens, inputs[:1, :past], no_depth=~has_depth)
         same_draws = jnp.zeros(candidates, jnp.int32)
@@ -179,8 +180,8 @@ class RoboScape(WorldModel[Batch]):
         return TokenImagination(self.config, self.architecture, self._codec(assets), params, clips)
 
     def branching(self, params: Params, assets: Assets, has_depth: bool, lanes: int = 1) -> TokenBranching:
-        codec = self._codec(assets)
-        return TokenBranching(self.config, self.architecture, codec, params, has_depth, lanes)
+        arch = self.architecture.generating(self.config.sample, has_depth)
+        return TokenBranching(self.config, arch, self._codec(assets), params, has_depth, lanes)
 
     def reconstruct(self, assets: Assets, video: Video) -> Video:
         codec = self._codec(assets)
@@ -191,7 +192,7 @@ class RoboScape(WorldModel[Batch]):
     ) -> TeacherForced:
         """Predicts each frame from the true frames before it. T may exceed the trained positions."""
         arch = self.architecture
-        tokens, has_depth = self._tokens(assets, video)
+        tokens, has_depth = self._tokens(assets, video, arch)
         if "depth" in arch.modalities and "depth" not in tokens:
             tokens["depth"] = jnp.zeros_like(tokens["rgb"])
         tokens, inputs = divide((tokens, self._action_inputs(assets, actions)), params)
@@ -214,9 +215,9 @@ class RoboScape(WorldModel[Batch]):
         assert assets.tokenizer is not None
         return Codec(self.tokenizer, assets.tokenizer, assets.normalization)
 
-    def _tokens(self, assets: Assets, video: Video) -> tuple[Tokens, np.ndarray]:
-        """Returns a video's tokens by branch (depth if the model and a clip have it), and which clips have depth."""
-        seen = video if self.config.uses_depth else Video(video.rgb)
+    def _tokens(self, assets: Assets, video: Video, arch: Architecture) -> tuple[Tokens, np.ndarray]:
+        """Returns a video's tokens by branch (depth if network and a clip have it), and which clips have depth."""
+        seen = video if arch.depth != "none" else Video(video.rgb)
         return {branch: jnp.asarray(grid) for branch, grid in self._codec(assets).encode(seen).items()}, seen.has_depth
 
     def _action_inputs(self, assets: Assets, actions: Float[np.ndarray, "B T A"]) -> Float[Array, "B T A2"]:

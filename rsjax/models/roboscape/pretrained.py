@@ -70,7 +70,7 @@ def shapes(own: Architecture, directory: Path) -> Params:
         free = FREE - {"action_encoder"}
         alike = ALIKE | {"integrate_actions"}
     if saved.depth == "none":
-        free = free | {"depth", "depth_width", "depth_blocks", "depth_cells"}
+        free = free | {"depth", "reads_depth", "depth_width", "depth_blocks", "depth_cells"}
     other = {field.name for field in fields(Departures)} - alike
     differing = "; ".join(
         filter(None, [differences(saved, own, free), differences(saved.departures, own.departures, other)])

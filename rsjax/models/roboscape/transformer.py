@@ -230,7 +230,8 @@ class Transformer(nn.Module):
     """Two branches of spatial-temporal blocks (``config.depth`` "branch"), or the RGB branch alone.
 
     With ``config.depth`` "head" the RGB branch also reads depth tokens, and a second head on its output predicts them.
-    Its modalities, what it reads and predicts, are "rgb" and "depth", or "rgb" alone.
+    Its modalities, what it predicts, are "rgb" and "depth", or "rgb" alone; it reads the same unless ``reads_depth`` is
+    False.
     """
 
     config: Architecture
@@ -276,7 +277,7 @@ class Transformer(nn.Module):
         if departures.read_previous and previous is None and not (isinstance(start, int) and start == 0):
             raise ValueError("the model reads the frame before these, which do not begin a clip: pass previous")
         b, t = mask.shape[:2]
-        cells = {name: tokens[name].reshape(b, t, cfg.grid**2, *tokens[name].shape[4:]) for name in cfg.modalities}
+        cells = {name: tokens[name].reshape(b, t, cfg.grid**2, *tokens[name].shape[4:]) for name in cfg.inputs}
 
         # Eq. 2: the sum of token, action and position embeddings, by branch.
         shared: dict[str, Any] = dict.fromkeys(cfg.branches, self._positions(cfg, "", t, start))
@@ -289,17 +290,18 @@ class Transformer(nn.Module):
             shared = {branch: shared[branch] + encoded[branch] for branch in cfg.branches}
             encoded = dict.fromkeys(cfg.branches)  # the blocks read them no more
         mask = hidden(departures, mask.reshape(b, t, cfg.grid**2), start)
-        masks = dict.fromkeys(cfg.modalities, mask)
+        masks = dict.fromkeys(cfg.inputs, mask)
         if "depth" in masks and no_depth is not None:
             masks["depth"] = mask | no_depth[:, None, None]
-        x = {name: self._embed(name, f"{name}_embed", cells[name], masks[name]) for name in cfg.modalities}
+        x = {name: self._embed(name, f"{name}_embed", cells[name], masks[name]) for name in cfg.inputs}
         x |= {branch: x[branch] + shared[branch] for branch in cfg.branches}
         if departures.read_previous:
             previous = previous or {name: frame_before(frames) for name, frames in cells.items()}
-            for name, before in previous.items():
+            for name in cfg.inputs:
+                before = previous[name]
                 absent = absent_cells(name, before, start, no_depth)
                 x[name] = x[name] + self._embed(name, f"{name}_previous_embed", before, absent)
-        if cfg.depth == "head":
+        if cfg.depth == "head" and cfg.reads_depth:
             x = {"rgb": x["rgb"] + x["depth"]}
         x = {branch: features.astype(cfg.feature_dtype) for branch, features in x.items()}
 

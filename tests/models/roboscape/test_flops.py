@@ -41,6 +41,7 @@ def xla_flops(function: Any, *inputs: Any) -> float:
     [
         DUAL,
         replace(DUAL, depth="head"),
+        replace(DUAL, depth="head", reads_depth=False),
         replace(DUAL, depth_width=16, action_encoder="mlp"),
         replace(DUAL, depth_blocks=1),
         replace(DUAL, grid=4, depth_width=16, depth_cells=2, departures=Departures(read_previous=True)),
@@ -49,7 +50,18 @@ def xla_flops(function: Any, *inputs: Any) -> float:
         replace(DUAL, depth_blocks=1, action_encoder="norms"),
         replace(DUAL, depth="head", action_encoder="norms", departures=Departures(more_norms=True)),
     ],
-    ids=["dual", "head", "narrow", "shallow", "coarse", "genie", "other shapes", "adaptive", "adaptive head"],
+    ids=[
+        "dual",
+        "head",
+        "unread head",
+        "narrow",
+        "shallow",
+        "coarse",
+        "genie",
+        "other shapes",
+        "adaptive",
+        "adaptive head",
+    ],
 )
 def test_a_pass_of_the_world_model_is_the_formula_to_the_letter(config: Architecture) -> None:
     logits, params, inputs = world_model(config)

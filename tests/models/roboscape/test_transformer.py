@@ -23,10 +23,12 @@ from tests.models.roboscape.toy import (
     RGB,
     SHALLOW,
     SMALL,
+    UNREAD,
     WHOLE,
     apply,
     apply_plain,
     blind,
+    depart,
     forward,
     plain_forward,
     random_inputs,
@@ -36,7 +38,7 @@ from tests.models.roboscape.toy import (
 CONFIGS = {"dual": DUAL, "rgb": RGB, "normed": NORMED, "qk-norm": QK_NORM, "previous": READS_PREVIOUS, "genie": GENIE}
 CONFIGS |= {"whole-frames": WHOLE, "head": HEAD, "head-previous": replace(READS_PREVIOUS, depth="head")}
 SMALLER = {"narrow": NARROW, "shallow": SHALLOW, "coarse": COARSE, "small": SMALL}
-CONFIGS |= SMALLER
+CONFIGS |= SMALLER | {"head-unread": UNREAD, "head-unread-previous": depart(UNREAD, read_previous=True)}
 CONFIGS |= {"adaptive": ADAPTIVE, "adaptive-head": replace(HEAD, action_encoder="norms")}
 CONFIGS |= {
     "adaptive-rgb": replace(RGB, action_encoder="norms"),

@@ -22,6 +22,7 @@ def depart(architecture: Architecture, **departures: Any) -> Architecture:
 DUAL = Architecture(frames=5, grid=2, code_bits=4, action_inputs=3, width=8, blocks=2, heads=2)
 RGB = replace(DUAL, depth="none")
 HEAD = replace(DUAL, depth="head")
+UNREAD = replace(HEAD, reads_depth=False)
 NARROW = replace(DUAL, depth_width=4)
 SHALLOW = replace(DUAL, depth_blocks=1)
 COARSE = replace(DUAL, depth_cells=2)
@@ -174,7 +175,8 @@ def plain_forward(config: Architecture, params: Any, inputs: tuple) -> dict[str,
         mask[:, 1:] = True
     h = {}
     conditions: dict[str, Any] = {}
-    for name, grid in tokens.items():
+    for name in config.inputs:
+        grid = tokens[name]
         flat = grid.reshape(b, t, -1)
         x = merge(embed(flat, mask.reshape(b, t, -1), p[f"{name}_embed"], config), name, "embed", p, config)
         if config.departures.read_previous:
@@ -193,7 +195,7 @@ def plain_forward(config: Architecture, params: Any, inputs: tuple) -> dict[str,
             else:
                 h[name] += encoded
     if config.depth == "head":
-        h = {"rgb": h["rgb"] + h["depth"]}
+        h = {"rgb": sum(h.values(), np.zeros(()))}
     for block in range(config.blocks):
         group, place = divmod(block, config.blocks // config.groups)
         own = jax.tree.map(lambda x, group=group: x[group], p["blocks"])

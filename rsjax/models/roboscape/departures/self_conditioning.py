@@ -45,7 +45,7 @@ def previous_frames(
 
     Args:
         predict: the network on the true frames: returns its logits and its cache; not computed unless ``own``.
-        tokens: of the true frames, by branch.
+        tokens: of the true frames, by modality that the network reads.
         own: whether to return the model's codes; the same on all devices.
         prompt_frames: those that generation starts from.
     """
@@ -53,7 +53,7 @@ def previous_frames(
 
     def predicted() -> Previous:
         logits, _ = predict()
-        means = {name: lfq.mean_codes(x, code_bits) for name, x in logits.items()}
+        means = {name: lfq.mean_codes(logits[name], code_bits) for name in tokens}
         joined = partial(jnp.concatenate, axis=1)
         return {name: joined([true[name][:, :prompt_frames], mean[:, prompt_frames:]]) for name, mean in means.items()}
 
