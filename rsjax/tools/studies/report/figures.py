@@ -1,6 +1,7 @@
 """Draws a generated clip: a filmstrip, an animation, and its keypoints."""
 
 from dataclasses import dataclass
+from textwrap import wrap
 
 import matplotlib
 import numpy as np
@@ -19,6 +20,7 @@ _TRAILS = matplotlib.colormaps["plasma"]
 
 _CELL_ANIMATION = 192  # approximate side of a frame in pixels
 _CELL_FILMSTRIP = 128
+_LABEL_LETTERS = 18  # that fit beside a filmstrip
 _FILMSTRIP_COLUMNS = 8
 _CELL_KEYPOINTS = 448
 
@@ -113,7 +115,8 @@ def filmstrip(clip: ClipFigure) -> UInt8[np.ndarray, "h w 3"]:
         draw.text((x + width // 2, y - 6), name, fill=_FAINT, font=font(13), anchor="ms")
     for i, (label, frames) in enumerate(rows):
         y, x = filmstrip_cell(clip, i, 0)
-        draw.text((x - 10, y + height // 2), label, fill=_TEXT, font=font(14), anchor="rm", align="right")
+        lines = [line for part in label.splitlines() for line in wrap(part, _LABEL_LETTERS)]
+        draw.text((x - 10, y + height // 2), "\n".join(lines), fill=_TEXT, font=font(14), anchor="rm", align="right")
         for j, frame in enumerate(resize(frames[times], scale)):
             y, x = filmstrip_cell(clip, i, j)
             sheet.paste(Image.fromarray(frame), (x, y))
