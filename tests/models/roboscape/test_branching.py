@@ -138,7 +138,7 @@ def test_clips_that_one_program_generates_together_are_the_same_but_for_rounding
         np.testing.assert_array_equal(mine.tokens["rgb"], expected[number].tokens["rgb"])
         entropy, its = mine.entropy, expected[number].entropy
         assert entropy is not None and its is not None
-        np.testing.assert_allclose(entropy, its, rtol=1e-3, atol=1e-5)
+        np.testing.assert_allclose(entropy, its, rtol=3e-3, atol=1e-5)
 
 
 def test_going_on_from_a_lightened_memory_gives_the_same_bits(lanes: Branching, clips: Store) -> None:
