@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from rsjax.config import require
-from rsjax.config.run import Config
 from rsjax.errors import UserError
 from rsjax.evaluation.registry import metrics
 from rsjax.evaluation.statistics import wilson
@@ -55,25 +54,21 @@ def write_runs(path: Path, runs: Sequence[Run]) -> None:
         if found is None:
             raise UserError(f"{run.directory}: not a finished run; finish it with experiments.train")
         require(
-            _without_seeds(run.config) == _without_seeds(runs[0].config),
+            _without_seeds(asdict(run.config)) == _without_seeds(asdict(runs[0].config)),
             f"{run.directory} has another configuration than {runs[0].directory}; give runs that differ in their seeds",
         )
         per_clip = read_per_clip(run)
         clips = {name: [rounded(x, CLIP_DIGITS) for x in per_clip[name]] for name in names if name in per_clip}
         numbers = {name: rounded(found[name], SEED_DIGITS) for name in names if name in found}
         scores.append({"seed": run.config.train.seed, "metrics": numbers, "clips": clips})
-    about = {"kind": KIND, "preset": runs[0].config.name, "training_clips": runs[0].config.sim.episodes}
+    about = {"kind": KIND, "preset": runs[0].config.name}
     write_file(path, as_text(about | provenance(runs) | {"runs": scores}).encode())
 
 
-def _without_seeds(config: Config) -> Any:
-    """Returns a configuration as a dictionary without its seeds."""
-    return _strip(asdict(config))
-
-
-def _strip(value: Any) -> Any:
+def _without_seeds(value: Any) -> Any:
+    """Returns a configuration, or a part of one, without its seeds."""
     if isinstance(value, dict):
-        return {name: _strip(part) for name, part in value.items() if name != "seed"}
+        return {name: _without_seeds(part) for name, part in value.items() if name != "seed"}
     return value
 
 
