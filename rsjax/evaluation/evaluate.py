@@ -27,12 +27,24 @@ from rsjax.data.store import Store, StoreError
 from rsjax.devices import replicate
 from rsjax.errors import UserError
 from rsjax.evaluation.depth_estimator import DepthEstimator, estimate_depth
-from rsjax.evaluation.generation import OWN, Generation, teacher_forced
-from rsjax.evaluation.localiser import recorded_places, train_localiser
-from rsjax.evaluation.metrics import delta_psnr, fvd
+from rsjax.evaluation.generation import OWN, Generation, teacher_forced, with_baselines
+from rsjax.evaluation.localiser import Localiser, recorded_places, train_localiser
+from rsjax.evaluation.metrics import contact, delta_psnr, drive, fvd
 from rsjax.evaluation.metrics.lpips import check_lpips
+from rsjax.evaluation.probes import Probes, probe, with_probes
 from rsjax.evaluation.protocols import Protocol, check, of_run
-from rsjax.evaluation.registry import Located, Metric, PerClip, PerFrame, Places, Scene, Unavailable, metrics
+from rsjax.evaluation.registry import (
+    NO_PROBES,
+    Located,
+    Metric,
+    PerClip,
+    PerFrame,
+    Places,
+    Probed,
+    Scene,
+    Unavailable,
+    metrics,
+)
 from rsjax.evaluation.results import Curves, Evaluation
 from rsjax.evaluation.shown import kept_frames, shown_arrays
 from rsjax.evaluation.statistics import bootstrap
@@ -120,6 +132,7 @@ def evaluate(
     eval_clips: EvaluationClips | None = None,
     folder: Path | None = None,
     estimator: DepthEstimator | None = None,
+    probes: Probes | Unavailable = NO_PROBES,
 ) -> Evaluation:
     """Scores a model and two baselines on held-out clips: the last prompt frame repeated, and the reconstruction.
 
@@ -129,6 +142,7 @@ def evaluate(
         eval_clips: the clips to score; None: those of the store's test split.
         folder: where generated batches are kept until the evaluation is finished; None: in memory.
         estimator: estimates depth from frames; None: no scores of estimated depth.
+        probes: episodes of the clips' simulator that test contacts and free driving, or why there are none.
 
     Raises:
         StoreError: a test clip is damaged.
@@ -143,7 +157,13 @@ def evaluate(
     generation = plan(trained, store, eval_clips, folder)
     generation.make()
 
-    locate = locating(generation.trained, store, eval_clips.records, clips.rgb.shape[1] - 1)
+    localiser = localiser_of(settings, store, eval_clips.records)
+    locate = None if localiser is None else locating(localiser, eval_clips.records, clips.rgb.shape[1] - 1)
+    probed: Mapping[str, Probed] | Unavailable = NO_PROBES
+    if isinstance(probes, Unavailable):
+        probed = probes
+    elif localiser is not None:
+        probed = probe(generation.trained, localiser, probes, protocol, folder)
     predicted_tokens = teacher_forced(generation.trained, protocol, clips)
     repetitions: list[Scored] = []
     curves: list[Curves] = []
@@ -158,6 +178,7 @@ def evaluate(
             predicted_tokens,
             eval_clips.retakes,
         )
+        scenes = with_probes(scenes, probed)
         scored = score_all(scenes, protocol, trained.config.model.takes_actions)
         repetitions.append(with_best(scored, scenes[""], generation.samples(run), protocol))
         curves.append(frame_curves(scenes))
@@ -240,11 +261,8 @@ def make_scenes(
         predicted_tokens: how well the model predicts tokens from true frames.
         retakes: second recordings of the clips' scenes.
     """
-    reconstruction = trained.model.reconstruct(trained.assets, clips.video)
-    shown = {"": videos[OWN][0], "_repeat_first": _repeat_first(clips.metric_video, protocol.prompt_frames)}
-    if reconstruction is not None:
-        shown["_tokenizer"] = reconstruction
-    truth = scored_frames(trained, protocol, clips, reconstruction)
+    shown = with_baselines(trained, clips, videos[OWN][0], protocol.prompt_frames)
+    truth = scored_frames(trained, protocol, clips, shown.get("_tokenizer"))
     compared = {suffix: scaled(video, protocol.resolution) for suffix, video in shown.items()}
     estimated = {}
     if estimator is not None:
@@ -293,41 +311,39 @@ def scored_frames(
     return scaled(truth, protocol.resolution)
 
 
-def locating(trained: TrainedModel, store: Store, records: Sequence[Record], last: int) -> Locate | None:
-    """Trains a localiser and returns a function that pairs its reading of a video's last frames with the truth.
-
-    Returns None if the clips do not record where cube and gripper are.
+def localiser_of(settings: EvalConfig, store: Store, records: Sequence[Record]) -> Localiser | None:
+    """Trains the network that reads where cube and gripper are; returns None if the clips do not record it.
 
     Args:
         store: the store of the run; the localiser learns from its training clips.
         records: the scored clips.
-        last: the index of the last frame that is scored.
     """
-    recorded = recorded_places(records)
-    if recorded is None:
+    if recorded_places(records) is None:
         return None
     train = store.source("train")
     clips = [clip for _, clip in readable(train, spread(train, LOCALISER_CLIPS))]
     if recorded_places(clips) is None:
         return None
+    return train_localiser(clips, settings.localiser_steps)
+
+
+def locating(localiser: Localiser, records: Sequence[Record], last: int) -> Locate:
+    """Returns a function that pairs the localiser's reading of a video's last frames with the truth.
+
+    Args:
+        records: the scored clips, which record places.
+        last: the index of the last frame that is scored.
+    """
+    recorded = recorded_places(records)
+    assert recorded is not None
     places, width = recorded
     truth = Places(places.xy[:, last], places.lifted[:, last])
-    localiser = train_localiser(clips, trained.config.eval.localiser_steps)
     on_truth = localiser(np.stack([record["rgb"][last] for record in records]))
 
     def locate(video: Video, own: bool) -> Located:
         return Located(truth, width, on_truth if own else None, localiser(video.rgb[:, -1]))
 
     return locate
-
-
-def _repeat_first(video: Video, prompt_frames: int) -> Video:
-    """Returns a video that repeats the last prompt frame: the baseline without motion."""
-    last = video.frames(prompt_frames - 1, prompt_frames)
-    frames = video.rgb.shape[1]
-    if last.depth is None:
-        return Video(np.repeat(last.rgb, frames, 1))
-    return Video(np.repeat(last.rgb, frames, 1), np.repeat(last.depth, frames, 1))
 
 
 def scaled(video: Video, side: int) -> Video:
@@ -480,6 +496,7 @@ def frame_curves(scenes: Mapping[str, Scene]) -> Curves:
     prompt = scenes[""].prompt_frames
     frames = scenes[""].truth.rgb.shape[1]
     curves: Curves = {"frame": list(range(prompt + 1, frames + 1))}
+    curves |= drive.axis(scenes[""]) | contact.success_curves(scenes[""])
     for metric in metrics().values():
         if metric.per_frame is None:
             continue

@@ -219,6 +219,28 @@ def rolled_out(
     return _joined([steps[0], *(step.frames(-1) for step in steps[1:])], axis=1)
 
 
+def with_baselines(trained: TrainedModel, clips: Clips, prediction: Video, prompt_frames: int) -> dict[str, Video]:
+    """Returns the prediction and both baselines by the suffix that names their scores.
+
+    "_repeat_first" repeats the last prompt frame; "_tokenizer" is the reconstruction of the recorded frames, for models
+    that have one.
+    """
+    shown = {"": prediction, "_repeat_first": _repeat_first(clips.metric_video, prompt_frames)}
+    reconstruction = trained.model.reconstruct(trained.assets, clips.video)
+    if reconstruction is not None:
+        shown["_tokenizer"] = reconstruction
+    return shown
+
+
+def _repeat_first(video: Video, prompt_frames: int) -> Video:
+    """Returns a video that repeats the last prompt frame: the baseline without motion."""
+    last = video.frames(prompt_frames - 1, prompt_frames)
+    frames = video.rgb.shape[1]
+    if last.depth is None:
+        return Video(np.repeat(last.rgb, frames, 1))
+    return Video(np.repeat(last.rgb, frames, 1), np.repeat(last.depth, frames, 1))
+
+
 def _joined(parts: list[Video], axis: int = 0) -> Video:
     """Joins videos of several batches, or parts of one video; a part without depth gets NaN if another has depth."""
     rgb = np.concatenate([part.rgb for part in parts], axis)

@@ -18,6 +18,7 @@ import numpy as np
 import optax
 from flax import linen as nn
 from jaxtyping import Array, Float, Float32, Int, UInt8
+from scipy.special import expit
 
 from rsjax.data.codec import Record
 from rsjax.data.shift import moved
@@ -94,10 +95,22 @@ class Localiser:
 
     def __call__(self, rgb: UInt8[np.ndarray, "B H W 3"], batch: int = 256) -> Places:
         """Returns where cube and gripper are in frames, and whether the cube is lifted."""
+        xy, logit = self._read(rgb, batch)
+        return Places(np.clip(xy, 0, 1), logit > 0)
+
+    def lifted(self, rgb: UInt8[np.ndarray, "B H W 3"], batch: int = 256) -> Float[np.ndarray, " B"]:
+        """Returns the probability that the cube is lifted, for each frame."""
+        _, logit = self._read(rgb, batch)
+        return expit(logit)
+
+    def _read(
+        self, rgb: UInt8[np.ndarray, "B H W 3"], batch: int
+    ) -> tuple[Float[np.ndarray, "B 2 2"], Float[np.ndarray, " B"]]:
+        """Returns places and the logit of "lifted"."""
         rows = [np.minimum(np.arange(i, i + batch), len(rgb) - 1) for i in range(0, len(rgb), batch)]
         parts = [_apply(self.params, rgb[each]) for each in rows]
         xy, logit = (np.concatenate([np.asarray(part[i]) for part in parts])[: len(rgb)] for i in (0, 1))
-        return Places(np.clip(xy, 0, 1), logit > 0)
+        return xy, logit
 
 
 def train_localiser(clips: Sequence[Record], steps: int) -> Localiser:

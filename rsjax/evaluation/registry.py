@@ -79,6 +79,58 @@ class Located:
         return {"": self.prediction} | ({"_truth": self.on_truth} if self.on_truth else {})
 
 
+@dataclass(frozen=True)
+class Grasps:
+    """Grasps at set offsets between fingers and cube: how each ends in the simulator, and how it looks in a scene.
+
+    Attributes:
+        offset: horizontal distance from the cube's centre to where the fingers close, metres.
+        success: whether the cube is lifted at the end, as the simulator says.
+        on_truth: the probability of success that a network reads from the simulator's last frame; None in the scenes of
+            baselines.
+        prediction: the same from the scene's last frame, under the same first frames and actions.
+    """
+
+    offset: Float[np.ndarray, " G"]
+    success: Bool[np.ndarray, " G"]
+    on_truth: Float[np.ndarray, " G"] | None
+    prediction: Float[np.ndarray, " G"]
+
+    def read(self) -> dict[str, Float[np.ndarray, " G"]]:
+        """Returns the probabilities of success that the network read, by suffix of the metrics' names."""
+        return {"": self.prediction} | ({} if self.on_truth is None else {"_truth": self.on_truth})
+
+
+@dataclass(frozen=True)
+class Drives:
+    """Free drives of the arm in the simulator and in a scene, under the same first frames and actions.
+
+    Attributes:
+        gripper: its true place in each frame, as in :class:`Places`.
+        width: the cube's width in the unit of ``gripper``.
+        on_truth: its place as a network reads it from the simulator's frames; None in the scenes of baselines.
+        located: the same from the scene's frames.
+    """
+
+    truth: Video
+    prediction: Video
+    gripper: Float[np.ndarray, "D T 2"]
+    width: Float[np.ndarray, " D"]
+    on_truth: Float[np.ndarray, "D T 2"] | None
+    located: Float[np.ndarray, "D T 2"]
+
+
+@dataclass(frozen=True)
+class Probed:
+    """What became of simulated probes in a scene."""
+
+    grasps: Grasps
+    drives: Drives
+
+
+NO_PROBES = Unavailable("no grasps and drives were simulated for this evaluation")
+
+
 @dataclass(frozen=True, eq=False)
 class Scene:
     """Inputs of a metric: B clips, of which the first ``prompt_frames`` frames are the prompt.
@@ -91,6 +143,7 @@ class Scene:
         located: where cube and gripper are in the last frame; None if the clips do not record it.
         teacher_forced: how well the model predicts each frame's tokens; None for a baseline or a model without tokens.
         second_take: the same scenes recorded once more (same start, same task), for Physics-IQ's score.
+        probed: grasps at set offsets and free drives, or why there are none.
         settings: the settings of the evaluation, with the paths of weights.
         truth_cache: what :meth:`of_truth` has computed; scenes with the same truth share it.
     """
@@ -103,9 +156,26 @@ class Scene:
     located: Located | None = None
     teacher_forced: TeacherForced | None = None
     second_take: Video | None = None
+    probed: Probed | Unavailable = NO_PROBES
     settings: EvalConfig = field(default_factory=EvalConfig)
     truth_cache: dict[Any, Any] = field(default_factory=dict, repr=False)
     _shared: dict[Any, Any] = field(default_factory=dict, init=False, repr=False)
+
+    @property
+    def grasps(self) -> Grasps:
+        """The grasps at set offsets; raises :class:`Unavailable` without any."""
+        return self._probed.grasps
+
+    @property
+    def drives(self) -> Drives:
+        """The free drives; raises :class:`Unavailable` without any."""
+        return self._probed.drives
+
+    @property
+    def _probed(self) -> Probed:
+        if isinstance(self.probed, Unavailable):
+            raise self.probed
+        return self.probed
 
     def shared(self, function: Callable[..., T], *arguments: Any) -> T:
         """Returns ``function(self, *arguments)``, computed once for all metrics that call it."""
@@ -139,6 +209,7 @@ class Metric:
         interval: whether its bootstrap interval is reported.
         statistic: how the clips' scores are summarised.
         column: whether tables have a column for it.
+        axis: the entry of curves.json over which the metric's curve runs.
         function: scores a scene, with one number per clip or one for all clips, or raises :class:`Unavailable`; None
             for a number that is not computed from videos.
         per_frame: scores every predicted frame of a scene, or raises :class:`Unavailable`; None for a metric without a
@@ -155,6 +226,7 @@ class Metric:
     interval: bool = True
     statistic: Statistic = "mean"
     column: bool = True
+    axis: str = "frame"
     function: Callable[[Scene], Scores] | None = None
     per_frame: Callable[[Scene], PerFrame] | None = None
 
@@ -180,6 +252,7 @@ def metric(
     interval: bool = True,
     statistic: Statistic = "mean",
     column: bool = True,
+    axis: str = "frame",
     per_frame: Callable[[Scene], PerFrame] | None = None,
 ) -> Callable[[Callable[[Scene], Scores]], Callable[[Scene], Scores]]:
     """Registers a function as a metric; the arguments are the fields of :class:`Metric`.
@@ -191,7 +264,7 @@ def metric(
     def register(function: Callable[[Scene], Scores]) -> Callable[[Scene], Scores]:
         if name in _METRICS:
             raise ConfigError(f"two metrics are named {name!r}; rename one of them")
-        settings = (name, title, unit, better, decimals, needs, watch, interval, statistic, column)
+        settings = (name, title, unit, better, decimals, needs, watch, interval, statistic, column, axis)
         _METRICS[name] = Metric(*settings, function, per_frame)
         return function
 

@@ -43,6 +43,10 @@ def eval_clips() -> list[dict[str, np.ndarray]]:
 
 
 PLACES = {"cube_error_widths", "gripper_error_widths", "lifted_accuracy"}
+PROBED = {
+    *("contact_false_success", "contact_false_failure", "contact_brier", "contact_judge_accuracy"),
+    *("drive_gripper_error_widths", "drive_psnr"),
+}
 TRUTH = {name: np.stack([clip[name] for clip in eval_clips()]) for name in ("rgb", "depth", "actions")}
 
 
@@ -109,6 +113,7 @@ def test_every_registered_metric_has_a_score_or_a_reason(result: Evaluation) -> 
     assert {name for name in result.reasons if "estimator" not in name} == {
         *("lpips_alex", "lpips_vgg", "fvd", "physics_iq_score"),
         *PLACES,
+        *PROBED,
     }
     assert result.metrics["depth_absrel_median_branch_repeat_first"] > 0
 

@@ -1,4 +1,4 @@
-"""Finds the clips that an evaluation scores: a run's own, longer episodes, unseen scenes, and second takes."""
+"""Finds the clips that an evaluation scores: a run's own, longer episodes, unseen scenes, second takes, and probes."""
 
 from collections.abc import Callable, Collection
 from dataclasses import replace
@@ -8,20 +8,25 @@ from typing import TypeVar
 import numpy as np
 
 from rsjax.clip import Video
-from rsjax.config import SimConfig
+from rsjax.config import SimConfig, from_dict
 from rsjax.data.codec import Record
 from rsjax.data.store import Store, StoreError, open_store
-from rsjax.errors import UserError
+from rsjax.errors import UserError, first_line
 from rsjax.evaluation.evaluate import EvaluationClips
+from rsjax.evaluation.probes import Probes
 from rsjax.evaluation.protocols import Protocol
-from rsjax.progress import Progress
+from rsjax.evaluation.registry import Unavailable
+from rsjax.progress import Progress, note
 from rsjax.tools.pipeline.run import Run
 from rsjax.tools.sim import retakes
 from rsjax.tools.sim.collect import Report, collect, collection_key
+from rsjax.tools.sim.episode import source_name
+from rsjax.tools.sim.probes import collect_probes
 from rsjax.tools.sim.unseen import collect_unseen, unseen_splits
 from rsjax.training.distributed import on_lead
 
 LONGER_SEED = 1_000_000  # added to a run's seed, so that longer episodes differ from the run's own
+LEAST_CLIPS = 48  # scored clips from which on grasps and drives are worth their time
 LONGER_TRAIN = 2  # episodes in the train split of longer episodes, which nothing uses
 T = TypeVar("T")
 
@@ -80,16 +85,50 @@ def with_second_takes(eval_clips: EvaluationClips, workers: int) -> EvaluationCl
     return replace(eval_clips, retakes=Video(np.stack([take["rgb"][: clips.rgb.shape[1]] for take in takes])))
 
 
+def probes_of(run: Run, store: Store, eval_clips: EvaluationClips) -> Probes | Unavailable:
+    """Returns grasps and drives in the simulator of a run's clips, or why the evaluation has none.
+
+    They are simulated unless they exist. Only the lead process calls this.
+
+    Args:
+        store: the run's clips, beside which the probes are kept.
+    """
+    protocol = eval_clips.protocol
+    source = store.manifest.get("source")
+    if not run.config.model.takes_actions:
+        return Unavailable("the model takes no actions")
+    if source != source_name(SimConfig()):
+        return Unavailable(f"grasps and drives are simulated in Lift alone; the clips are of {source or 'recordings'}")
+    if eval_clips.split != "test":
+        return Unavailable(f"grasps and drives are scored with the split test, not with {eval_clips.split}")
+    if protocol.teacher_forced:
+        return Unavailable(f"protocol {protocol.name} gives the true frames before each predicted one")
+    if protocol.clips < LEAST_CLIPS:
+        return Unavailable(
+            f"{protocol.clips} clips are scored; grasps and drives are simulated where {LEAST_CLIPS} or more are"
+        )
+    config = from_dict(SimConfig, store.manifest["config"] | {"workers": run.config.sim.workers})
+    with Progress("simulating grasps and drives", 0, "episodes") as progress:
+        try:
+            return collect_probes(config, store, _report_to(progress))
+        except UserError as error:  # such as a machine without OpenGL; the other metrics do not need it
+            note(f"no grasps and drives: {first_line(error)}")
+            return Unavailable(first_line(error))
+
+
 def _simulated(what: str, make: Callable[[Report], T]) -> T:
     """Returns clips that the lead process makes unless they exist; the other processes then find them."""
     with Progress(f"simulating {what}", 0, "episodes") as progress:
+        on_lead("simulation", make, _report_to(progress))
+        return make(_report_to(progress))
 
-        def report(done: int, total: int) -> None:
-            progress.total = total
-            progress.update(done)
 
-        on_lead("simulation", make, report)
-        return make(report)
+def _report_to(progress: Progress) -> Report:
+    def report(done: int, total: int) -> None:
+        progress.total = total
+        progress.update(done)
+
+    return report
 
 
 def longer_episodes(sim: SimConfig, frames: int, clips: int) -> SimConfig:

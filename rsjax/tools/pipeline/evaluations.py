@@ -24,13 +24,13 @@ from rsjax.models.load_run import load, load_config
 from rsjax.models.trained import TrainedModel
 from rsjax.progress import note
 from rsjax.tools.pipeline.depth_stage import check_depth, depth_estimator
-from rsjax.tools.pipeline.evaluation_clips import chosen_splits, evaluation_store, with_second_takes
+from rsjax.tools.pipeline.evaluation_clips import chosen_splits, evaluation_store, probes_of, with_second_takes
 from rsjax.tools.pipeline.metric_files import by_content, check_metric_files
 from rsjax.tools.pipeline.provenance import code_version, data_fingerprint, machine, training_settings
 from rsjax.tools.pipeline.run import RECIPE, Run
 from rsjax.tools.pipeline.run_clips import relocated
 from rsjax.tools.pipeline.videos import resampled
-from rsjax.tools.sim import retakes
+from rsjax.tools.sim import probes, retakes
 from rsjax.training.distributed import barrier, is_lead, on_lead
 
 FOLDER = "evaluations"
@@ -162,7 +162,10 @@ def _evaluate(
             if old != parts:  # from an evaluation with other settings that never finished
                 shutil.rmtree(old, ignore_errors=True)
         estimator = depth_estimator(run)
-        found = evaluation.evaluate(trained, store, eval_clips=eval_clips, folder=parts, estimator=estimator)
+        simulated = probes_of(run, store, eval_clips)
+        found = evaluation.evaluate(
+            trained, store, eval_clips=eval_clips, folder=parts, estimator=estimator, probes=simulated
+        )
         about = {"label": name, "key": key, "code": code_version(Path(rsjax.__file__).resolve().parents[1])}
         about |= _described(trained, run, store, eval_clips)
         write_result(folder, result_of(found, **about), found.kept)
@@ -203,7 +206,8 @@ def _key(trained: TrainedModel, store: Store, eval_clips: EvaluationClips) -> st
     ]
     protocol = json.dumps([eval_clips.protocol.described(), _sample_settings(trained.config), data, eval_clips.split])
     takes = [] if eval_clips.retakes is None else [json.dumps([retakes.RECIPE, retakes.JITTER])]
-    return content_key(RECIPE, "evaluation", protocol, _weights(trained), by_content(trained.config.eval), *takes)
+    settings = by_content(trained.config.eval)
+    return content_key(RECIPE, "evaluation", probes.RECIPE, protocol, _weights(trained), settings, *takes)
 
 
 def _weights(trained: TrainedModel) -> str:

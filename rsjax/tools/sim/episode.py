@@ -13,7 +13,9 @@ from rsjax.config import SimConfig, to_dict
 from rsjax.config.metaworld import SIMPLE
 from rsjax.config.sim import CONTROLS
 from rsjax.tools.sim import lift, metaworld
+from rsjax.tools.sim.drives import Drive
 from rsjax.tools.sim.expert import SIMPLE as SIMPLE_MODES
+from rsjax.tools.sim.grasps import Grasp
 from rsjax.tools.sim.render import Camera, View
 from rsjax.tools.sim.scenery import SEEN, Change, Variation, draw_variation
 from rsjax.tools.sim.tracks import Snapshot, grid_pixels, object_pixels, track
@@ -77,6 +79,7 @@ class EpisodePlan:
         task: the Meta-World task; empty in Lift.
         change: what looks different from training.
         replay: actions that replace the expert's.
+        manner: that of the expert in Lift; None: one is drawn.
     """
 
     name: str
@@ -84,6 +87,7 @@ class EpisodePlan:
     task: str = ""
     change: Change | None = None
     replay: Replay | None = None
+    manner: Grasp | Drive | None = None
 
 
 class Simulators:
@@ -137,7 +141,10 @@ def run_episode(sim: Simulator, config: SimConfig, plan: EpisodePlan) -> Clip:
     else:
         looks = SEEN
     sim.reset(int(rng.integers(2**32)), looks)
-    expert = sim.draw_expert(rng)
+    if plan.manner:
+        expert: Expert = plan.manner.expert(rng)
+    else:
+        expert = sim.draw_expert(rng)
     act = expert.act
     if plan.replay:
         act = _replayed(plan.replay, CONTROLS[config.env], np.random.default_rng([config.seed, episode, 4]))

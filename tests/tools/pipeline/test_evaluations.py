@@ -19,7 +19,9 @@ from rsjax.evaluation import evaluate as evaluation
 from rsjax.evaluation.depth_estimator import DepthEstimator
 from rsjax.evaluation.evaluate import EvaluationClips
 from rsjax.evaluation.metrics import fvd
+from rsjax.evaluation.probes import Probes
 from rsjax.evaluation.protocols import Protocol, find
+from rsjax.evaluation.registry import Unavailable
 from rsjax.evaluation.results import Evaluation, read_frames, read_result
 from rsjax.files import write_json
 from rsjax.models.trained import TrainedModel
@@ -27,7 +29,7 @@ from rsjax.runtime import HUGE_PAGES
 from rsjax.tokenizers.magvit2 import Tokenizer
 from rsjax.tools.pipeline import evaluation_clips as eval_clips
 from rsjax.tools.pipeline import evaluations
-from rsjax.tools.pipeline.evaluation_clips import evaluation_store, longer_episodes
+from rsjax.tools.pipeline.evaluation_clips import evaluation_store, longer_episodes, probes_of
 from rsjax.tools.pipeline.evaluations import Request, evaluate_own, evaluate_run
 from rsjax.tools.pipeline.run import Run
 from rsjax.tools.pipeline.run_clips import on_store
@@ -37,6 +39,7 @@ from tests.tools.pipeline import toy
 from tests.tools.pipeline.conftest import Commands
 
 FRAMES = toy.config().clips.frames
+LIFT = "robosuite/Lift/Panda"
 CHANGES = {"horizon": FRAMES - 1, "clips": toy.TEST, "action_draws": 0}
 MADE: list[Path] = []  # where batches of the evaluations that were made lie
 
@@ -49,6 +52,7 @@ def scored(
     eval_clips: EvaluationClips,
     folder: Path,
     estimator: DepthEstimator | None = None,
+    probes: Probes | Unavailable,
 ) -> Evaluation:
     """Stands for an evaluation, whose scores other tests look at: PSNR rises by 1 dB from clip to clip."""
     MADE.append(folder)
@@ -322,6 +326,35 @@ def test_only_splits_that_there_can_be_are_simulated(
     protocol = replace(find("paper", run.config), splits=splits, horizon=frames - 1)
     store = run.open_clips()
     assert evaluation_store(simulating, store, protocol) == (simulated or store)
+
+
+@pytest.mark.parametrize(
+    ("source", "split", "changes", "reason"),
+    [
+        (None, "test", {}, "grasps and drives are simulated in Lift alone; the clips are of recordings"),
+        (
+            "metaworld/Sawyer",
+            "test",
+            {},
+            "grasps and drives are simulated in Lift alone; the clips are of metaworld/Sawyer",
+        ),
+        (LIFT, "train", {}, "grasps and drives are scored with the split test, not with train"),
+        (LIFT, "test", {"teacher_forced": True}, "protocol paper gives the true frames before each predicted one"),
+        (LIFT, "test", {}, "5 clips are scored; grasps and drives are simulated where 48 or more are"),
+    ],
+)
+def test_an_evaluation_without_grasps_and_drives_says_why(
+    run: Run, source: str | None, split: str, changes: dict[str, Any], reason: str
+) -> None:
+    store = run.open_clips()
+    store = replace(store, manifest=store.manifest | {"source": source})
+    protocol = replace(find("paper", run.config), horizon=FRAMES - 1, clips=5, **changes)
+    chosen = EvaluationClips.read(store, "test", protocol, run.config.clips)
+    found = probes_of(run, store, replace(chosen, split=split))
+    assert isinstance(found, Unavailable)
+    assert str(found) == reason
+    inactive = replace(run, config=toy.with_model(run.config, action_encoder="none"))
+    assert str(probes_of(inactive, store, chosen)) == "the model takes no actions"
 
 
 def test_longer_episodes_are_none_of_the_runs_own() -> None:

@@ -13,13 +13,14 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
 from rsjax.errors import UserError
+from rsjax.evaluation.metrics import contact
 from rsjax.evaluation.registry import Metric
 from rsjax.evaluation.results import Curves, read_frames
 from rsjax.evaluation.shown import extremes
 from rsjax.files import write_file
 from rsjax.progress import note
 from rsjax.tools.studies.compare.table import Comparison, difference_table, legend, score_table
-from rsjax.tools.studies.report.curves import Chart, charts_svg
+from rsjax.tools.studies.report.curves import INK, Chart, charts_svg
 from rsjax.tools.studies.report.figures import ClipFigure, filmstrip
 from rsjax.tools.studies.report.page import template_environment
 from rsjax.tools.studies.report.video import webp_uri
@@ -143,6 +144,8 @@ def _label(name: str) -> str:
 def _curves(comparison: Comparison) -> str:
     """Draws a chart for each metric over the predicted frames; a line is the mean over an entry's seeds."""
     charts = [_chart(comparison, metric) for metric in comparison.metrics if _lines(comparison, metric)]
+    if charts and all(contact.AXIS in result.curves for group in comparison.groups for result in group.results):
+        charts.append(_offset_chart(comparison))
     return charts_svg(charts, "scores frame by frame", legend=True, height=2.3) if charts else ""
 
 
@@ -153,8 +156,27 @@ def _lines(comparison: Comparison, metric: Metric) -> list[tuple[str, np.ndarray
         name = entry.score(metric)
         if all(name in each for each in curves):
             points = np.mean([np.array(each[name], float) for each in curves], axis=0)
-            lines.append((entry.name, np.array(curves[0]["frame"], float), points))
+            lines.append((entry.name, np.array(curves[0][metric.axis], float), points))
     return lines
+
+
+def _offset_chart(comparison: Comparison) -> Chart:
+    """Draws the share of grasps that succeed over their offset: in the simulator, and in each group's model."""
+
+    def draw(axes: Axes) -> None:
+        curves = comparison.groups[0].results[0].curves
+        offsets = np.array(curves[contact.AXIS], float)
+        truth = np.array(curves[contact.SIMULATOR], float)
+        axes.plot(offsets, truth, ":", color=INK, linewidth=1.3, label="simulator")
+        axes.legend(fontsize=8, frameon=False)
+        for number, group in enumerate(comparison.groups):
+            shares = [np.array(result.curves[contact.MODEL], float) for result in group.results]
+            axes.plot(offsets, np.mean(shares, axis=0), color=COLORS[number % len(COLORS)], linewidth=1.3)
+        axes.set_ylim(-0.02, 1.02)
+        axes.set_title("share of grasps that succeed", fontsize=9, loc="left")
+        axes.set_xlabel("offset of the fingers from the cube, cm", fontsize=8)
+
+    return draw
 
 
 def _chart(comparison: Comparison, metric: Metric) -> Chart:

@@ -15,7 +15,13 @@ from rsjax.progress import duration
 from rsjax.tools.studies.report.curves import curves_svg
 from rsjax.tools.studies.report.figures import ClipFigure, filmstrip, keypoints
 from rsjax.tools.studies.report.player import player_clip, player_script, player_style
-from rsjax.tools.studies.report.score_charts import PLACE_SCENES, SCENES, frame_curves_svg, place_errors_svg
+from rsjax.tools.studies.report.score_charts import (
+    PLACE_SCENES,
+    SCENES,
+    frame_curves_svg,
+    place_errors_svg,
+    probes_svg,
+)
 from rsjax.tools.studies.report.targets import judge
 from rsjax.tools.studies.report.video import webp_uri
 from rsjax.tools.studies.tables import CellText, Footnotes, Marked, Table, as_html
@@ -30,6 +36,9 @@ _SCORE_ROWS = tuple(SCENES.items())
 _PLACE_ROWS = tuple(PLACE_SCENES.items())
 _PLACE_ERRORS = ("cube_error_widths", "gripper_error_widths")
 _PLACES = (*_PLACE_ERRORS, "lifted_accuracy")  # metrics in a table of their own
+_CONTACTS = ("contact_false_success", "contact_false_failure", "contact_brier")
+_DRIVES = ("drive_gripper_error_widths", "drive_psnr")
+_APART = (*_PLACES, *_CONTACTS, "contact_judge_accuracy", *_DRIVES)  # metrics that the tables of scores leave out
 _DEPTH_ROWS = (
     ("", "predicted depth, in metres"),
     ("_median_branch", "predicted depth, median scale"),
@@ -92,8 +101,14 @@ def write_report(path: Path, report: RunReport) -> None:
     environment.filters["duration"] = duration
     shown = [metric for metric in metrics().values() if metric.column]
     places = [metrics()[name] for name in _PLACES]
-    scored = [metric for metric in shown if metric not in places]
-    further = [metric for metric in metrics().values() if not (metric.column or metric.name.startswith("depth_"))]
+    contacts = [metrics()[name] for name in _CONTACTS]
+    drives = [metrics()[name] for name in _DRIVES]
+    scored = [metric for metric in shown if metric.name not in _APART]
+    further = [
+        metric
+        for metric in metrics().values()
+        if not (metric.column or metric.name in _APART or metric.name.startswith("depth_"))
+    ]
     notes = Footnotes()
     html = environment.get_template("page.html.j2").render(
         report=report,
@@ -107,7 +122,10 @@ def write_report(path: Path, report: RunReport) -> None:
         control=_table(report, "ΔPSNR under", notes, _CONTROL_ROWS, _CONTROL_COLUMNS),
         places=_table(report, "last frame", Footnotes(), _PLACE_ROWS, _columns(places)),
         place_errors=Markup(place_errors_svg(report.per_clip, places[: len(_PLACE_ERRORS)])),
-        frame_curves=Markup(frame_curves_svg(report.curves, [*shown, *further])),
+        contacts=_table(report, "grasps", Footnotes(), _PLACE_ROWS, _columns(contacts)),
+        drives=_table(report, "drives", Footnotes(), _PLACE_ROWS, _columns(drives)),
+        probes=Markup(probes_svg(report.curves, drives)),
+        frame_curves=Markup(frame_curves_svg(report.curves, [*scored, *further])),
         notes=notes.texts,
         targets=_targets(report) if report.show_targets else None,
         training={name: Markup(curves_svg(log, name)) for name, log in report.logs.items() if log},

@@ -1,4 +1,4 @@
-"""Draws scores as inline SVG: curves over the predicted frames, and the errors of places, sorted over clips."""
+"""Draws scores as inline SVG: curves over the predicted frames, sorted errors of places, and what became of probes."""
 
 from collections.abc import Mapping, Sequence
 
@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
 
+from rsjax.evaluation.metrics import contact
 from rsjax.evaluation.registry import Metric
 from rsjax.evaluation.results import Curves
 from rsjax.tools.studies.report.curves import INK, LINE, Chart, charts_svg
@@ -35,9 +36,33 @@ def place_errors_svg(per_clip: Mapping[str, Sequence[float]], metrics: Sequence[
     return charts_svg(charts, "errors of places", legend=True, height=2.3) if charts else ""
 
 
+def probes_svg(curves: Curves, metrics: Sequence[Metric]) -> str:
+    """Draws the metrics of drives frame by frame, and success over the offset of grasps; returns "" without probes."""
+    if contact.AXIS not in curves:
+        return ""
+    charts = [_curve_chart(curves, metric) for metric in metrics if metric.name in curves]
+    return charts_svg([*charts, _offset_chart(curves)], "drives and grasps", legend=True, height=2.3)
+
+
+def _offset_chart(curves: Curves) -> Chart:
+    def draw(axes: Axes) -> None:
+        offsets = _numbers(curves[contact.AXIS])
+        for suffix, (name, label) in {"_truth": (contact.SIMULATOR, "simulator"), "": (contact.MODEL, "model")}.items():
+            low, high = (_numbers(curves[f"{name}_{side}"]) for side in ("low", "high"))
+            color = _COLORS[suffix]
+            axes.plot(offsets, _numbers(curves[name]), _DASHES[suffix], color=color, linewidth=1.3, label=label)
+            axes.fill_between(offsets, low, high, color=color, alpha=0.18, linewidth=0)
+        axes.set_ylim(-0.02, 1.02)
+        axes.set_title("share of grasps that succeed", fontsize=9, loc="left")
+        axes.set_xlabel("offset of the fingers from the cube, cm", fontsize=8)
+        axes.legend(fontsize=8, frameon=False)
+
+    return draw
+
+
 def _curve_chart(curves: Curves, metric: Metric) -> Chart:
     def draw(axes: Axes) -> None:
-        frames = _numbers(curves["frame"])
+        frames = _numbers(curves[metric.axis])
         for suffix, label in SCENES.items():
             name = f"{metric.name}{suffix}"
             if name not in curves:

@@ -35,6 +35,20 @@ TARGETS = (
     Target("cube's place in the last frame, median error", itemgetter("cube_error_widths"), 0.3, False, "widths"),
     Target("gripper's place, likewise", itemgetter("gripper_error_widths"), 0.3, False, "widths"),
     Target("lifted or not, share read right", itemgetter("lifted_accuracy"), 0.9, unit=""),
+    Target(
+        "grasps that fail in the simulator, share that succeed in the model",
+        itemgetter("contact_false_success"),
+        0.2,
+        False,
+        "",
+    ),
+    Target(
+        "gripper's place in frame 48 of a drive, median error",
+        itemgetter("drive_gripper_error_widths"),
+        0.5,
+        False,
+        "widths",
+    ),
     Target("ΔPSNR, another clip's actions", itemgetter("delta_psnr"), 7.0),
     Target(
         "depth AbsRel, relative to repeating the first frame",

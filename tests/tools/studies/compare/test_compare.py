@@ -144,6 +144,33 @@ def row_of(clip: ComparedClip) -> int:
     return int(re.findall(r"\d+", clip.title)[0]) // 2
 
 
+def test_grasps_and_drives_are_compared_with_their_curves(make: Make, tmp_path: Path) -> None:
+    def probed(gain: float, lies: list[float]) -> Result:
+        plain = toy.result(gain)
+        curves = {
+            "contact_offset_cm": [0.0, 2.0, 4.0],
+            "contact_simulator": [1.0, 0.5, 0.0],
+            "contact_model": [1.0] * 3,
+        }
+        curves |= {"drive_frame": [2.0, 3.0], "drive_psnr": [20.0 + gain, 18.0 + gain]}
+        scores = {"contact_false_success": float(np.mean(lies)), "drive_psnr": 19.0 + gain}
+        per_clip = {"contact_false_success": lies, "drive_psnr": [18.0 + gain, 20.0 + gain]}
+        return replace(
+            plain,
+            metrics=plain.metrics | scores,
+            per_clip=plain.per_clip | per_clip,
+            curves=plain.curves | curves,
+        )
+
+    found = compare(read_groups([make("a", probed(0.0, [1.0] * 9)), make("b", probed(1.0, [0.0] * 9))], None))
+    assert [each.finding for each in found.differences["contact_false_success"] if each] == ["better"]
+    assert "lifted where the simulator fails ↓" in as_markdown(found)
+    write_page(tmp_path / "page.html", found, "the command")
+    page = (tmp_path / "page.html").read_text()
+    assert page.count(">share of grasps that succeed<") == 1
+    assert page.count(">PSNR of drives, dB ↑<") == 1
+
+
 def test_strips_show_the_ends_of_all_clips_and_of_the_kept_ones(make: Make) -> None:
     plain = toy.result(0.0)
     result = replace(plain, per_clip=plain.per_clip | {"psnr": (10.0 + 7 * np.arange(toy.CLIPS) % 40).tolist()})

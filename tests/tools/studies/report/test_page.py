@@ -143,12 +143,39 @@ def test_an_absent_metric_has_its_reason_as_a_footnote(tmp_path):
     assert "¹ no <weights>." in page.text and "² no depth." in page.text
 
 
+def test_grasps_and_drives_have_tables_and_curves_of_their_own(tmp_path):
+    curves = {"drive_frame": [2, 3], "contact_offset_cm": [0.0, 2.0]}
+    for name in ("drive_psnr", "contact_simulator", "contact_model"):
+        curves |= {name: [0.9, 0.5], f"{name}_low": [0.8, 0.4], f"{name}_high": [1.0, 0.6]}
+    scores = {"contact_false_success": 0.85, "contact_false_success_truth": 0.02, "contact_judge_accuracy": 0.976}
+    scores |= {"drive_psnr": 14.5, "drive_psnr_repeat_first": 15.0}
+    write_report(tmp_path / "r.html", RunReport("tiny", _METRICS | scores, curves=_CURVES | curves))
+    page = _Page(tmp_path / "r.html")
+    assert ["grasps", "lifted where the simulator fails ↓"] in page.cells
+    assert ["prediction", "0.850"] in page.cells
+    assert ["true frames (the reading network's own error)", "0.020"] in page.cells
+    assert ["drives", "PSNR of drives, dB ↑"] in page.cells
+    assert ["first frame repeated", "15.00"] in page.cells
+    assert "in 98 % of the simulator's" in " ".join(page.text.split())
+    assert page.text.count("PSNR of drives, dB ↑") == 2  # its table and its curve
+
+
 def test_missing_parts_are_left_out(tmp_path, make_clip):
     write_report(tmp_path / "bare.html", RunReport(preset="debug", metrics={"psnr": 20.0}))
     page = _Page(tmp_path / "bare.html")
     assert ["test clips", "PSNR, dB ↑"] in page.cells
     assert "script" not in page.tags
-    for absent in ("Targets", "Keypoints", "Training", "Clip by clip", "ΔPSNR", "Command", "Frame by", "Where cube"):
+    for absent in (
+        "Targets",
+        "Keypoints",
+        "Training",
+        "Clip by clip",
+        "ΔPSNR",
+        "Command",
+        "Frame by",
+        "Where cube",
+        "Grasps",
+    ):
         assert absent not in page.text
     clip = make_clip(true_depth=None, predicted_depth=None, tracks=None, visible=None, selected=None)
     write_report(tmp_path / "rgb.html", RunReport(preset="debug", metrics={}, clips=[clip]))

@@ -3,7 +3,7 @@ import re
 import numpy as np
 
 from rsjax.evaluation.registry import metrics
-from rsjax.tools.studies.report.score_charts import frame_curves_svg, place_errors_svg
+from rsjax.tools.studies.report.score_charts import frame_curves_svg, place_errors_svg, probes_svg
 
 _METRICS = [metrics()[name] for name in ("psnr", "ssim", "cube_error_widths", "gripper_error_widths")]
 _BASE = {"frame": [2, 3, 4]}
@@ -53,3 +53,17 @@ def test_errors_of_places_are_drawn_from_the_best_clip_to_the_worst():
     np.testing.assert_allclose(steps, steps[0], rtol=1e-3)  # a straight line on a logarithmic scale
     assert steps[0] < 0
     assert place_errors_svg({"psnr": [20.0]}, _METRICS[2:]) == ""
+
+
+def test_drives_have_their_own_frames_and_grasps_both_worlds():
+    drives = [metrics()["drive_psnr"], metrics()["drive_gripper_error_widths"]]
+    curves = _BASE | {"drive_frame": [2, 3, 4, 5], "contact_offset_cm": [0.0, 2.0]}
+    curves |= _curve("drive_psnr", [27.0, 26.0, 24.0, 22.0]) | _curve("drive_psnr_repeat_first", [20.0] * 4)
+    curves |= _curve("contact_simulator", [1.0, 0.5]) | _curve("contact_model", [1.0, 1.0])
+    svg = probes_svg(curves, drives)
+    assert svg.count(">PSNR of drives, dB ↑<") == svg.count(">first frame repeated<") == 1
+    assert svg.count(">simulator<") == svg.count(">model<") == 1
+    psnr, model = _lines(svg, "#3b7dd8")
+    assert len(psnr) == 4
+    assert len(set(model)) == 1
+    assert probes_svg(_BASE, drives) == ""
