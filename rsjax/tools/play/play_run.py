@@ -18,6 +18,7 @@ from rsjax.data.codec import Record
 from rsjax.data.store import Source, Store, StoreError
 from rsjax.devices import on_cpu
 from rsjax.errors import UserError, first_line
+from rsjax.files import FileError, read_json
 from rsjax.models.trained import TrainedModel
 from rsjax.tools.play.controls import Controls, controls_of_run
 from rsjax.tools.play.messages import Refused
@@ -25,6 +26,8 @@ from rsjax.tools.policies.policy import Policy
 from rsjax.tools.policies.run_data import RunData
 
 SIMULATED = ("robosuite/Lift", "metaworld/")  # sources of clips whose simulator is available here
+# Scores of the run's evaluation that say how far to trust what the page shows.
+MEASURED = ("contact_false_success", "drive_gripper_error_widths")
 FPS = 5.0  # for runs whose clips have no frame rate
 
 
@@ -138,6 +141,14 @@ class PlayRun:
         return from_dict(SimConfig, self.store.manifest["config"])
 
     @cached_property
+    def measured(self) -> dict[str, float]:
+        """The scores of :data:`MEASURED` that ``metrics.json`` has; empty before the run is finished."""
+        with suppress(FileError):
+            scores = read_json(self.data.run / "metrics.json")
+            return {name: scores[name] for name in MEASURED if isinstance(scores.get(name), float)}
+        return {}
+
+    @cached_property
     def fingerprint(self) -> str:
         """A hash of the weights, 16 hexadecimal digits: a link works for runs with the same fingerprint."""
         digest = hashlib.sha256(repr(self.trained.config.model).encode())
@@ -173,5 +184,6 @@ class PlayRun:
             "clips": self.clips,
             "missing": self.missing,
             "source": str(self.store.manifest.get("source") or "") if self.store else "",
+            "measured": self.measured,
             "device": "cpu" if on_cpu() else jax.devices()[0].device_kind,
         }

@@ -11,6 +11,7 @@ import numpy as np
 
 from rsjax.clip import Video
 from rsjax.data.normalization import Normalization
+from rsjax.files import write_json
 from rsjax.models.branch_states import BranchState, Decoding
 from rsjax.tools.play.engine import Engine
 from rsjax.tools.play.hub import Hub
@@ -19,6 +20,7 @@ from rsjax.tools.play.truth import Truths
 from rsjax.tools.policies.run_data import RunData
 from tests.tools.pipeline import toy
 
+MEASURED = {"contact_false_success": 0.85}
 LIGHT = 4  # every so many frames there is a small memory
 
 
@@ -108,6 +110,7 @@ def play_run(folder: Path, fakes: Fakes, depth: bool = True) -> PlayRun:
     clips, config = toy.store(folder / "clips", depth), toy.config()
     norm = Normalization.create(clips)
     assets = SimpleNamespace(normalization=norm, tokenizer=None)
+    write_json(folder / "metrics.json", {"psnr": 20.0, "drive_gripper_error_widths": None} | MEASURED)
     data = RunData(folder)
     data.__dict__["trained"] = SimpleNamespace(config=config, model=fakes, params={"a": np.ones(3)}, assets=assets)
     data.__dict__["config"], data.__dict__["clips"] = config, clips

@@ -90,6 +90,7 @@ def _drive(page: Any, key: str, length: int) -> None:
 
 def test_a_person_drives_rewinds_and_branches(opened: Open, tmp_path: Path) -> None:
     page = opened()
+    assert "85 % succeed here" in page.inner_text("#measured")
     first = page.evaluate(_PIXELS)
     page.keyboard.press("r")  # however short
     page.wait_for_function(_LENGTH, arg=2)

@@ -15,7 +15,7 @@ from PIL import Image
 from rsjax.config import DataConfig
 from rsjax.tools.play.play_run import PlayRun
 from tests.tools.play.client import Client, Picture, Server
-from tests.tools.play.fake import LIGHT, Fakes
+from tests.tools.play.fake import LIGHT, MEASURED, Fakes
 from tests.waiting import wait_until
 
 
@@ -35,6 +35,7 @@ def test_the_first_message_says_what_there_is(server: Server, run: PlayRun) -> N
         assert len(welcome["controls"]) * welcome["repeat"] == welcome["action_dim"] == run.controls.width
         assert [each["kind"] for each in welcome["controls"]] == ["axis"] * 6 + ["toggle"]
         assert welcome["sources"]["clip"] == "" and "--policy" in welcome["sources"]["policy"]
+        assert welcome["run"]["measured"] == MEASURED
 
 
 def test_a_step_brings_a_frame_and_says_what_was_done(server: Server, run: PlayRun) -> None:

@@ -28,6 +28,7 @@ export function build() {
   const { connection, transport, shows } = state;
   document.title = `rsjax · play · ${run.name}`;
   at("run").textContent = `${run.name} · ${run.image_size} × ${run.image_size} · ${run.device}`;
+  at("measured").textContent = trust(run.measured);
   const view = (title, kinds) => makeView({ title, kinds, size: run.image_size, depthRange: run.depth_range ?? FAR });
   const set = (fields) => attempt(connection.call("settings", fields));
   const facing = run.source?.startsWith("robosuite/");
@@ -57,6 +58,14 @@ export function build() {
   if (run.has_depth) at("depth-scale").append(...scale(run.depth_range));
   showKeys(at("key-list"), keyList(state.parts.stick.keys));
   listen();
+}
+
+/** Says how far the model can be trusted, from scores of the run's evaluation; "" without any. */
+function trust({ contact_false_success: lied, drive_gripper_error_widths: off }) {
+  const lines = [];
+  if (lied !== undefined) lines.push(`of the grasps that fail in the simulator, ${(100 * lied).toFixed(0)} % succeed here`);
+  if (off !== undefined) lines.push(`after 48 frames of free driving the gripper is ${off.toFixed(1)} cube widths astray`);
+  return lines.length ? `How far to trust it: ${lines.join("; ")}.` : "";
 }
 
 function listen() {
