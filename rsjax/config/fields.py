@@ -144,6 +144,7 @@ def from_dict(kind: type[T], values: dict[str, Any]) -> T:
     hints = {f.name: declared[f.name] for f in dataclasses.fields(typing.cast(Any, kind))}
     if "kind" not in hints and hasattr(kind, "kind"):
         values = {name: value for name, value in values.items() if name != "kind"}
+    values = {name: value for name, value in values.items() if name not in getattr(kind, "retired", ())}
     unknown = set(values) - set(hints)
     require(not unknown, f"{kind.__name__} has no field {', '.join(sorted(unknown))}; the file is of another version")
     return kind(**{name: _read(f"{kind.__name__}.{name}", hints[name], value) for name, value in values.items()})

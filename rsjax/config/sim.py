@@ -2,10 +2,10 @@
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 from rsjax.config.data import ClipShape
-from rsjax.config.fields import require, require_range, runtime
+from rsjax.config.fields import later, require, require_range
 from rsjax.config.metaworld import ML45, ML45_UNSEEN, TASKS
 from rsjax.errors import did_you_mean
 
@@ -15,9 +15,16 @@ CONTROLS = {
 }  # numbers of a control step: change of the pose (6-D, or position alone) and gripper
 
 
+EXPERT = "expert"  # the scripted expert, the only one of the recipes that Meta-World has too
+RECIPES = (EXPERT, "grasps", "pushes", "slips", "driving", "novices")
+RECORDED = "recorded:"  # precedes the path of a store of a policy's recorded episodes
+
+
 @dataclass(frozen=True)
 class SimConfig:
     """Episodes collected in a simulator (:mod:`rsjax.tools.sim`)."""
+
+    retired: ClassVar[tuple[str, ...]] = ("workers",)  # fields that a file of an earlier version may have
 
     episodes: int = 200  # those of the test split included; more where training clips are learned by heart
     test_episodes: int = 20  # the last ones collected, never used in training
@@ -31,10 +38,12 @@ class SimConfig:
     # objects: up to half on a grid, the others on the objects and the arm's moving links, found by segmentation.
     track_points: Literal["grid", "objects"] = "grid"
     seed: int = 0  # of the scenes and the motions
-    workers: int = runtime(0)  # 0: one process per core
     env: Literal["lift", "metaworld"] = "lift"
     tasks: tuple[str, ...] = ()  # of Meta-World; none: the 45 training tasks of its ML45 benchmark
     unseen_tasks: tuple[str, ...] = ()  # for the protocol "unseen"; none: the 5 tasks that ML45 holds out
+    # What the training episodes show, each with its share: expert, grasps, pushes, slips, driving, novices, or
+    # recorded:PATH, such as expert=0.6 grasps=0.4. The test split is the expert's, whatever the recipe.
+    recipe: tuple[str, ...] = later((EXPERT,))
 
     def __post_init__(self) -> None:
         require(self.frames >= 2, f"sim.frames is {self.frames}; a clip needs at least 2 frames")
@@ -44,8 +53,8 @@ class SimConfig:
             f"({self.episodes - 1}), so that both splits have clips",
         )
         require_range(self, "sim", 1, math.inf, "control_steps", "image_size", "tracks")
-        require_range(self, "sim", 0, math.inf, "workers")
         self._check_tasks()
+        self._check_recipe()
 
     def _check_tasks(self) -> None:
         named = {"tasks": self.tasks, "unseen_tasks": self.unseen_tasks}
@@ -61,6 +70,30 @@ class SimConfig:
         require(
             not both, f"sim.unseen_tasks has {', '.join(both)}, which sim.tasks trains on; a task is seen or unseen"
         )
+
+    def _check_recipe(self) -> None:
+        require(bool(self.recipe), f"sim.recipe is empty; name at least one of {', '.join(RECIPES)}")
+        for entry in self.recipe:
+            name, share = _parted(entry)
+            known = name in RECIPES or name.startswith(RECORDED)
+            require(
+                known,
+                f"sim.recipe names {name!r}{did_you_mean(name, RECIPES)} (recipes: {', '.join(RECIPES)}, "
+                f"{RECORDED}PATH)",
+            )
+            require(0 < share < math.inf, f"sim.recipe has {entry!r}; a share must be a number above 0")
+            require(
+                self.env == "lift" or name == EXPERT,
+                f"sim.recipe names {name!r}, but sim.env is {self.env}, which has {EXPERT} alone",
+            )
+        names = [_parted(entry)[0] for entry in self.recipe]
+        require(len(set(names)) == len(names), f"sim.recipe is {' '.join(self.recipe)}; name each recipe once")
+
+    @property
+    def shares(self) -> dict[str, float]:
+        """The recipes' shares of the training episodes, which sum to 1."""
+        shares = dict(map(_parted, self.recipe))
+        return {name: share / sum(shares.values()) for name, share in shares.items()}
 
     @property
     def train_tasks(self) -> tuple[str, ...]:
@@ -82,6 +115,17 @@ class SimConfig:
     def clips(self) -> ClipShape:
         """The shape of its clips; each episode is one clip."""
         return ClipShape(self.frames, self.image_size, self.tracks, self.action_dim, self.test_episodes)
+
+
+def _parted(entry: str) -> tuple[str, float]:
+    """Returns name and share of an entry ``NAME=SHARE``, or of ``NAME``, whose share is 1; NaN if it is no number."""
+    name, found, share = entry.rpartition("=")
+    if not found:
+        return entry, 1.0
+    try:
+        return name, float(share)
+    except ValueError:
+        return name, math.nan
 
 
 _NO_AGENTVIEW = "sim.camera is 'agentview', which Meta-World does not have; choose near, or one of its own, e.g. corner"

@@ -158,7 +158,8 @@ class RuntimeConfig:
     # as divide the batch; mesh with several hosts.
     sharding: Literal["auto", "jit", "pmap", "mesh"] = runtime("auto")
     fsdp: int = runtime(1)  # parts of the state, with sharding mesh; raise it where the state does not fit a device
-    workers: int = runtime(0)  # processes that read and prepare batches; 0: threads
+    # Processes that simulate episodes, or read and prepare batches. 0: one per core to simulate, and threads to read.
+    workers: int = runtime(0)
     max_damaged: float = runtime(0.01)  # share of the records that may be damaged before training stops
     wandb: str = runtime("")  # Weights & Biases project; empty: TensorBoard only
     profile: int = runtime(0)  # number of steps to trace after each start, into ``profile`` in the stage's directory

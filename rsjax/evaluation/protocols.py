@@ -126,6 +126,12 @@ PROTOCOLS = {
         replace(
             PAPER, name="unseen", splits=("unseen*",), origin="RoboScape: tasks, cameras or objects never trained on"
         ),
+        replace(
+            PAPER,
+            name="contacts",
+            splits=("contacts_*",),
+            origin="here: held-out grasps, pushes, slips, free driving and attempts of bad policies",
+        ),
     )
 }
 

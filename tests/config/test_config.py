@@ -92,6 +92,17 @@ def test_presets_are_hashable_and_survive_json(name: str) -> None:
     assert c.from_dict(c.Config, json.loads(json.dumps(c.to_dict(config)))) == config
 
 
+def test_a_stored_configuration_may_have_fields_that_have_gone_and_lack_those_that_have_come() -> None:
+    stored = c.to_dict(BASE.sim) | {"workers": 3}
+    del stored["recipe"]
+    assert c.from_dict(c.SimConfig, stored) == BASE.sim
+
+
+def test_shares_of_a_recipe_sum_to_one() -> None:
+    mixed = c.SimConfig(recipe=("expert=2.5", "recorded:runs/a=b/episodes=0.5", "grasps"))
+    assert mixed.shares == {"expert": 0.625, "recorded:runs/a=b/episodes": 0.125, "grasps": 0.25}
+
+
 def test_a_stored_configuration_with_an_unknown_field_is_refused_by_name() -> None:
     plain = c.to_dict(BASE)
     plain["train"]["optimizer"]["momentum"] = 0.9
@@ -185,7 +196,16 @@ def test_a_stored_value_of_another_type_is_refused_by_name(path: str, value: Any
         ("model.sample", {"window_stride": 6}, "model.sample.window_stride is 6 of 6 positions"),
         ("eval", {"clips": 1}, "eval.clips is 1 of sim.test_episodes 2"),
         ("eval", {"batch_size": 0}, "eval.batch_size is 0"),
-        ("sim", {"workers": -1}, "sim.workers is -1"),
+        ("sim", {"recipe": ()}, "sim.recipe is empty; name at least one of expert, grasps"),
+        ("sim", {"recipe": ("grasp=0.5",)}, "sim.recipe names 'grasp'; did you mean 'grasps'?"),
+        ("sim", {"recipe": ("grasps=some",)}, "sim.recipe has 'grasps=some'; a share must be a number above 0"),
+        ("sim", {"recipe": ("grasps=0",)}, "sim.recipe has 'grasps=0'; a share must be a number above 0"),
+        ("sim", {"recipe": ("grasps", "grasps=2")}, "sim.recipe is grasps grasps=2; name each recipe once"),
+        (
+            "sim",
+            {"env": "metaworld", "camera": "near", "recipe": ("grasps",)},
+            "sim.env is metaworld, which has expert",
+        ),
         ("sim", {"tasks": ("reach-v3",)}, "sim.tasks names 'reach-v3', but sim.env is lift"),
         ("sim", {"env": "metaworld", "camera": "near", "tasks": ("raech",)}, "no task of Meta-World; did you mean"),
         ("sim", {"env": "metaworld"}, "sim.camera is 'agentview', which Meta-World does not have"),

@@ -9,6 +9,7 @@ import numpy as np
 
 from rsjax.clip import Video
 from rsjax.config import SimConfig, from_dict
+from rsjax.config.sim import EXPERT
 from rsjax.data.codec import Record
 from rsjax.data.store import Store, StoreError, open_store
 from rsjax.errors import UserError, first_line
@@ -20,6 +21,7 @@ from rsjax.progress import Progress, note
 from rsjax.tools.pipeline.run import Run
 from rsjax.tools.sim import retakes
 from rsjax.tools.sim.collect import Report, collect, collection_key
+from rsjax.tools.sim.contacts import collect_contacts, contact_splits
 from rsjax.tools.sim.episode import source_name
 from rsjax.tools.sim.probes import collect_probes
 from rsjax.tools.sim.unseen import collect_unseen, unseen_splits
@@ -47,25 +49,31 @@ def _lacking(splits: Collection[str], wanted: tuple[str, ...]) -> list[str]:
 
 
 def evaluation_store(run: Run, store: Store, protocol: Protocol) -> Store:
-    """Returns the run's store, or a store of longer episodes or unseen scenes, which are simulated if necessary."""
+    """Returns the run's store, or one of longer episodes, unseen scenes or contacts, simulated if necessary."""
     sim = run.config.sim
+    workers = run.config.runtime.workers
     needed = protocol.prompt_frames + protocol.horizon
     if run.config.data is not None:
         return store
-    if _lacking(store.splits, protocol.splits) and not _lacking(unseen_splits(sim), protocol.splits):
-        count = min(protocol.clips, sim.test_episodes)
+    known = not _lacking(store.splits, protocol.splits)
+    count = min(protocol.clips, sim.test_episodes)
+    if not known and not _lacking(unseen_splits(sim), protocol.splits):
         return _simulated(
             f"scenes never seen, {count} episodes of each kind",
-            lambda report: collect_unseen(sim, store, count, report),
+            lambda report: collect_unseen(sim, store, count, report, workers),
         )
-    known = not _lacking(store.splits, protocol.splits)
+    if not known and not _lacking(contact_splits(sim), protocol.splits):
+        return _simulated(
+            f"contacts, {count} episodes of each kind",
+            lambda report: collect_contacts(sim, store, count, report, workers),
+        )
     if needed <= sim.frames or not known or chosen_splits(store, protocol.splits) != ["test"]:
         return store
     longer = longer_episodes(sim, needed, protocol.clips)
     path = run.data_directory / f"{sim.env}-{collection_key(longer)}"
 
     def make(report: Report) -> Store:
-        collect(longer, path, report)
+        collect(longer, path, report, workers)
         return open_store(path)
 
     return _simulated(f"{protocol.clips} episodes of {needed} frames; the run's have {sim.frames}", make)
@@ -134,4 +142,5 @@ def _report_to(progress: Progress) -> Report:
 def longer_episodes(sim: SimConfig, frames: int, clips: int) -> SimConfig:
     """Returns the configuration of held-out episodes that are longer than a run's, with a seed other than the run's."""
     seed = (sim.seed + LONGER_SEED) % 2**32
-    return replace(sim, frames=frames, seed=seed, episodes=clips + LONGER_TRAIN, test_episodes=clips)
+    episodes = clips + LONGER_TRAIN
+    return replace(sim, frames=frames, seed=seed, episodes=episodes, test_episodes=clips, recipe=(EXPERT,))

@@ -100,7 +100,7 @@ def evaluate_run(directory: Path, data: Path, request: Request) -> Iterator[Path
         chosen = EvaluationClips.read(scored_store, split, replace(protocol, splits=(split,)), config.clips)
         if request.retakes:
             name = f"{name},second-takes"
-            chosen = with_second_takes(chosen, config.sim.workers)
+            chosen = with_second_takes(chosen, config.runtime.workers)
         folder = directory / FOLDER / name
         evaluate_into(folder, name, trained, run, store, chosen, request.overwrite)
         yield folder

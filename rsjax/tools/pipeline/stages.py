@@ -142,7 +142,7 @@ def collect_clips(run: Run) -> None:
             )
         return
     with Progress("collect", cfg.sim.episodes, "episodes") as progress:
-        collect(cfg.sim, run.clips, lambda done, total: progress.update(done))
+        collect(cfg.sim, run.clips, lambda done, total: progress.update(done), cfg.runtime.workers)
 
 
 def train_tokenizer(run: Run, resume: bool) -> None:

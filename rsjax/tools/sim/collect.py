@@ -24,6 +24,7 @@ from rsjax.processes import WorkerDied, count_cores, run_items
 from rsjax.tools.sim import expert, metaworld
 from rsjax.tools.sim.episode import EpisodePlan, Simulators, run_episode, source_name, task_of
 from rsjax.tools.sim.gl import GLError, choose_gl
+from rsjax.tools.sim.recipes.plans import training_plans, versions
 
 RECIPES = {"lift": 6, "metaworld": 2}  # raise when the same configuration gives different episodes
 MAX_FAILURES = 0.1  # share of the episodes; more failures than this mean a broken installation
@@ -58,16 +59,18 @@ class Collection:
 def collection_key(config: SimConfig) -> str:
     """Returns the content key of the store that :func:`collect` makes."""
     modes = {"lift": expert.MODES, "metaworld": metaworld.MODES}[config.env]
-    return content_key(config.env, RECIPES[config.env], modes, config)
+    return content_key(config.env, RECIPES[config.env], modes, config, *versions(config))
 
 
-def collect(config: SimConfig, out: Path, report: Report) -> None:
+def collect(config: SimConfig, out: Path, report: Report, workers: int = 0) -> None:
     """Collects ``config.episodes`` episodes into a store at ``out``; the last ``test_episodes`` form its test split.
 
-    Returns at once if ``out`` is a store made by the same configuration, and waits if another process is making it.
+    The train split follows ``config.recipe``; the test split is the expert's, and the same whatever the recipe. Returns
+    at once if ``out`` is a store made by the same configuration, and waits if another process is making it.
 
     Args:
         report: called as episodes finish.
+        workers: processes that simulate; 0: one per core.
 
     Raises:
         GLError: there is no usable OpenGL library.
@@ -75,13 +78,15 @@ def collect(config: SimConfig, out: Path, report: Report) -> None:
         FileError: ``out`` cannot be written, e.g. on a full disk.
         CollectError: two worker processes die over an episode, or more than ``MAX_FAILURES`` of the episodes fail.
     """
-    cut = config.episodes - config.test_episodes
-    numbers = {"train": range(cut), "test": range(cut, config.episodes)}
-    plans = {split: tuple(EpisodePlan(f"{i:06d}", i, task_of(config, i)) for i in of) for split, of in numbers.items()}
-    make_store(Collection(collection_key(config), config, plans, {}), out, report)
+    test = range(config.episodes - config.test_episodes, config.episodes)
+    plans = {
+        "train": training_plans(config),
+        "test": tuple(EpisodePlan(f"{i:06d}", i, task_of(config, i)) for i in test),
+    }
+    make_store(Collection(collection_key(config), config, plans, {}), out, report, workers)
 
 
-def make_store(what: Collection, out: Path, report: Report) -> None:
+def make_store(what: Collection, out: Path, report: Report, workers: int = 0) -> None:
     """Makes a store of simulated episodes, as :func:`collect` documents it."""
     total = len(what.plans)
     if complete_key(out) == what.key:
@@ -103,12 +108,14 @@ def make_store(what: Collection, out: Path, report: Report) -> None:
         report(total - len(todo), total)
         if todo:
             with disk_guard(partial):
-                _simulate(what.config, partial, todo, total, report)
+                _simulate(what.config, partial, todo, total, report, workers)
         _pack(what, partial, out)
 
 
-def _simulate(config: SimConfig, partial: Path, todo: list[EpisodePlan], total: int, report: Report) -> None:
-    workers = min(config.workers or count_cores(), len(todo))
+def _simulate(
+    config: SimConfig, partial: Path, todo: list[EpisodePlan], total: int, report: Report, workers: int
+) -> None:
+    workers = min(workers or count_cores(), len(todo))
     done = total - len(todo)
 
     def settle(plan: EpisodePlan, died: WorkerDied | None) -> None:
@@ -116,7 +123,7 @@ def _simulate(config: SimConfig, partial: Path, todo: list[EpisodePlan], total: 
         if died is not None:  # leaving the episode out would make the store depend on this machine's memory
             raise CollectError(
                 f"simulator processes died over episode {plan.episode}, most likely for lack of memory, after {done} "
-                f"of {total} episodes; run again with fewer sim.workers (now {workers}), finished episodes are kept"
+                f"of {total} episodes; run again with fewer runtime.workers (now {workers}), finished episodes are kept"
             )
         done += 1
         report(done, total)

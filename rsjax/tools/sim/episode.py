@@ -13,9 +13,7 @@ from rsjax.config import SimConfig, to_dict
 from rsjax.config.metaworld import SIMPLE
 from rsjax.config.sim import CONTROLS
 from rsjax.tools.sim import lift, metaworld
-from rsjax.tools.sim.drives import Drive
 from rsjax.tools.sim.expert import SIMPLE as SIMPLE_MODES
-from rsjax.tools.sim.grasps import Grasp
 from rsjax.tools.sim.render import Camera, View
 from rsjax.tools.sim.scenery import SEEN, Change, Variation, draw_variation
 from rsjax.tools.sim.tracks import Snapshot, grid_pixels, object_pixels, track
@@ -56,6 +54,14 @@ class Simulator(Protocol):
     def places(self) -> dict[str, Float[np.ndarray, " 3"]]: ...  # positions of main object and gripper, in this order
 
 
+class Manner(Protocol):
+    """What an episode's scripted policy was drawn to do, as a dataclass; ``mode`` names the kind."""
+
+    @property
+    def mode(self) -> str: ...
+    def expert(self, rng: np.random.Generator, /) -> Expert: ...
+
+
 @dataclass(frozen=True, eq=False)
 class Replay:
     """Recorded actions that an episode repeats instead of following an expert.
@@ -63,10 +69,12 @@ class Replay:
     Attributes:
         actions: the actions of a clip; those of frame 0 lead into no frame and are not repeated.
         jitter: standard deviation of the noise added to each number; the sum is clipped to [-1, 1].
+        expert: the manner of the clip's expert, as its provenance has it; None: that which the episode's number draws.
     """
 
     actions: Float[np.ndarray, "T A"]
     jitter: float
+    expert: dict[str, Any] | None = None
 
 
 @dataclass(frozen=True)
@@ -75,11 +83,13 @@ class EpisodePlan:
 
     Attributes:
         name: name of the episode's file while a store is collected.
-        episode: its number; together with the seed it determines everything except the other fields.
+        episode: its number; together with the seed it determines start, noise and everything that no other field sets.
+            Episodes with one number and different manners start alike.
         task: the Meta-World task; empty in Lift.
         change: what looks different from training.
         replay: actions that replace the expert's.
-        manner: that of the expert in Lift; None: one is drawn.
+        manner: that of the expert; None: one is drawn.
+        seed: replaces the configuration's.
     """
 
     name: str
@@ -87,7 +97,8 @@ class EpisodePlan:
     task: str = ""
     change: Change | None = None
     replay: Replay | None = None
-    manner: Grasp | Drive | None = None
+    manner: Manner | None = None
+    seed: int | None = None
 
 
 class Simulators:
@@ -135,19 +146,24 @@ def run_episode(sim: Simulator, config: SimConfig, plan: EpisodePlan) -> Clip:
     Frame 0 is the initial state; ``config.control_steps`` control steps lead to each later frame.
     """
     episode = plan.episode
-    rng = np.random.default_rng([config.seed, episode])
+    seed = config.seed
+    if plan.seed is not None:
+        seed = plan.seed
+    rng = np.random.default_rng([seed, episode])
     if plan.change:
-        looks = draw_variation(plan.change, np.random.default_rng([config.seed, episode, 2]))
+        looks = draw_variation(plan.change, np.random.default_rng([seed, episode, 2]))
     else:
         looks = SEEN
     sim.reset(int(rng.integers(2**32)), looks)
     if plan.manner:
-        expert: Expert = plan.manner.expert(rng)
+        expert = plan.manner.expert(rng)
     else:
         expert = sim.draw_expert(rng)
     act = expert.act
+    manner = to_dict(expert.manner)
     if plan.replay:
-        act = _replayed(plan.replay, CONTROLS[config.env], np.random.default_rng([config.seed, episode, 4]))
+        act = _replayed(plan.replay, CONTROLS[config.env], np.random.default_rng([seed, episode, 4]))
+        manner = plan.replay.expert or manner
     views = []
     shots = []
     success = []
@@ -163,17 +179,17 @@ def run_episode(sim: Simulator, config: SimConfig, plan: EpisodePlan) -> Clip:
         places.append(sim.places)
         if frame == 0:
             bodies = sim.segment()
-            pixels = _track_pixels(config, sim, bodies, np.random.default_rng([config.seed, episode, 1]))
+            pixels = _track_pixels(config, sim, bodies, np.random.default_rng([seed, episode, 1]))
     tracks, visible = track(pixels, views[0].depth, bodies, shots)
-    provenance = _origin(config, episode) | {
-        "expert": to_dict(expert.manner),
+    provenance = _origin(config, seed, episode) | {
+        "expert": manner,
         "objects": _in_the_image(shots[0].camera, places, sim.object_width),
         "versions": {name: importlib.metadata.version(name) for name in _packages(config)},
     }
     if plan.task:
         simple = plan.task in SIMPLE
     else:
-        simple = expert.manner.mode in SIMPLE_MODES
+        simple = manner["mode"] in SIMPLE_MODES
     if simple:
         provenance["difficulty"] = "simple"
     else:
@@ -210,10 +226,10 @@ def _packages(config: SimConfig) -> tuple[str, ...]:
     return ("robosuite" if config.env == "lift" else "metaworld", "mujoco")
 
 
-def _origin(config: SimConfig, episode: int) -> dict[str, Any]:
+def _origin(config: SimConfig, seed: int, episode: int) -> dict[str, Any]:
     return {
         "source": source_name(config),
-        "seed": config.seed,
+        "seed": seed,
         "episode": episode,
         "camera": config.camera,
         "control_hz": 20 if config.env == "lift" else metaworld.CONTROL_HZ,

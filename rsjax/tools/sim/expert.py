@@ -15,6 +15,8 @@ TABLE_HEIGHT = 0.8  # metres
 OPEN = -1.0
 CLOSE = 1.0
 NOISE_MEMORY = 0.8  # correlation of the action noise from one control step to the next
+GAIN = 20.0  # action per metre of error: full speed until the goal is within 5 cm of the target
+TURN_GAIN = 1.5  # action per radian
 
 
 @dataclass(frozen=True)
@@ -95,9 +97,6 @@ class Expert:
         rng: generator of the action noise and of aimless motion.
     """
 
-    GAIN = 20.0  # action per metre of error: full speed until the goal is within 5 cm of the target
-    TURN_GAIN = 1.5  # action per radian
-
     def __init__(self, manner: Manner, rng: np.random.Generator) -> None:
         self.manner = manner
         self._rng = rng
@@ -114,16 +113,13 @@ class Expert:
         explores = self.manner.mode == "explore"
         target, finger = self._wander() if explores else self._pick(state)
         action = np.zeros(7)
-        action[:3] = np.clip(self.GAIN * (target - state.goal), -self.manner.speed, self.manner.speed)
+        action[:3] = np.clip(GAIN * (target - state.goal), -self.manner.speed, self.manner.speed)
         if not explores and self._phase in ("hover", "descend"):
-            # the cube looks the same after a quarter turn
-            error = (state.cube_yaw - state.gripper_yaw + np.pi / 4) % (np.pi / 2) - np.pi / 4
-            action[5] = np.clip(self.TURN_GAIN * error, -0.5, 0.5)
+            action[5] = yaw_action(state)
         if self._step < self.manner.delay:
             action[:] = 0
         scale = np.repeat([self.manner.noise, self.manner.turn_noise], 3)
-        fresh = np.sqrt(1 - NOISE_MEMORY**2) * scale * self._rng.standard_normal(6)
-        self._noise = NOISE_MEMORY * self._noise + fresh
+        self._noise = next_noise(self._noise, scale, self._rng)
         action[:6] += self._noise
         action[6] = finger
         self._step += 1
@@ -165,6 +161,21 @@ class Expert:
             else:
                 self._finger = CLOSE
         return self._goal, self._finger
+
+
+def yaw_action(state: State) -> float:
+    """Returns the turn about the vertical that brings the fingers parallel to the cube's sides."""
+    # the cube looks the same after a quarter turn
+    error = (state.cube_yaw - state.gripper_yaw + np.pi / 4) % (np.pi / 2) - np.pi / 4
+    return float(np.clip(TURN_GAIN * error, -0.5, 0.5))
+
+
+def next_noise(
+    noise: Float[np.ndarray, " 6"], scale: Float[np.ndarray, " 6"], rng: np.random.Generator
+) -> Float[np.ndarray, " 6"]:
+    """Returns the action noise of the next control step: autoregressive, with standard deviation ``scale``."""
+    fresh = np.sqrt(1 - NOISE_MEMORY**2) * scale * rng.standard_normal(6)
+    return NOISE_MEMORY * noise + fresh
 
 
 def skilled_expert(seed: int) -> Expert:

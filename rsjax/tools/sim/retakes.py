@@ -36,34 +36,40 @@ def collect_second_takes(
         UserError: the clips were not simulated, the simulator fails on one, or a take starts differently from its clip;
             also the errors of :func:`rsjax.tools.sim.collect.collect`.
     """
-    config = _config(clips, workers)
+    config = _config(clips)
     records = [clips.source(split)[number] for number in numbers]
-    plans = tuple(_plan(config, split, record) for record in records)
+    plans = tuple(_plan(config, f"{split}-{place:06d}", record) for place, record in enumerate(records))
     key = content_key("second takes", RECIPE, str(clips.manifest.get("key")), split, tuple(map(int, numbers)), JITTER)
     meta = {name: clips.manifest[name] for name in UNITS} | {
         "retakes": {"of": clips.manifest.get("key"), "split": split, "jitter": JITTER}
     }
     out = clips.path / FOLDER / key
-    make_store(Collection(key, config, {split: plans}, meta), out, report)
+    make_store(Collection(key, config, {split: plans}, meta), out, report, workers)
     made = open_store(out).source(split)
-    takes = {take["provenance"]["episode"]: take for take in map(made.__getitem__, range(len(made)))}
+    takes = {_identity(take): take for take in map(made.__getitem__, range(len(made)))}
     for record in records:
-        _check(record, takes.get(record["provenance"]["episode"]), f"{clips.path}, split {split}")
-    return [takes[record["provenance"]["episode"]] for record in records]
+        _check(record, takes.get(_identity(record)), f"{clips.path}, split {split}")
+    return [takes[_identity(record)] for record in records]
 
 
-def _config(clips: Store, workers: int) -> SimConfig:
+def _identity(record: Record) -> tuple[int, str]:
+    """Returns what tells a clip from the others of its split; paired clips have one episode's number."""
+    origin = record["provenance"]
+    return origin["episode"], str(origin["expert"])
+
+
+def _config(clips: Store) -> SimConfig:
     """Returns the configuration that simulated a store's clips."""
     manifest = clips.manifest
     config = manifest.get("config")
     if isinstance(config, dict) and "control_steps" in config and "episodes" in config:
-        found = from_dict(SimConfig, config | {"workers": workers})
+        found = from_dict(SimConfig, config)
         if source_name(found) == manifest.get("source"):
             return found
     raise UserError(f"{clips.path}: these clips were not simulated, so there is no second take of them")
 
 
-def _plan(config: SimConfig, split: str, record: Record) -> EpisodePlan:
+def _plan(config: SimConfig, name: str, record: Record) -> EpisodePlan:
     """Returns the plan of a clip's second take, with the same change of appearance if the clip has one."""
     origin = record["provenance"]
     if config.env == "metaworld":
@@ -71,8 +77,8 @@ def _plan(config: SimConfig, split: str, record: Record) -> EpisodePlan:
     else:
         task = ""
     change = origin.get("unseen", {}).get("what")
-    replay = Replay(record["actions"], JITTER)
-    return EpisodePlan(f"{split}-{origin['episode']:06d}", origin["episode"], task, change, replay)
+    replay = Replay(record["actions"], JITTER, origin["expert"])
+    return EpisodePlan(name, origin["episode"], task, change, replay, seed=origin["seed"])
 
 
 def _check(record: Record, take: Record | None, where: str) -> None:

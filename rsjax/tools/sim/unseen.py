@@ -19,7 +19,7 @@ RECIPE = 1  # raise when the same configuration gives different episodes
 UNITS = ("depth_range", "action_mean", "action_std")
 
 
-def collect_unseen(config: SimConfig, clips: Store, episodes: int, report: Report) -> Store:
+def collect_unseen(config: SimConfig, clips: Store, episodes: int, report: Report, workers: int = 0) -> Store:
     """Collects ``episodes`` clips for each split, unless they exist, and returns their store.
 
     Its splits are :func:`unseen_splits`. It has the depth range and action statistics of ``clips``, so that a model
@@ -29,6 +29,7 @@ def collect_unseen(config: SimConfig, clips: Store, episodes: int, report: Repor
         config: the configuration of ``clips``.
         clips: the store that training reads.
         report: called as episodes finish.
+        workers: processes that simulate; 0: one per core.
 
     Raises:
         ConfigError: ``episodes`` is not between 1 and ``config.test_episodes``.
@@ -47,7 +48,7 @@ def collect_unseen(config: SimConfig, clips: Store, episodes: int, report: Repor
         "seen": collection_key(config),
     }
     out = clips.path / FOLDER / key
-    make_store(Collection(key, config, splits, meta), out, report)
+    make_store(Collection(key, config, splits, meta), out, report, workers)
     return open_store(out)
 
 

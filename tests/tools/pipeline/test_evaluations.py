@@ -314,6 +314,9 @@ def test_what_cannot_be_evaluated_is_one_line(run: Run, request_: Request, says:
         (("unseen_camera", "tset"), FRAMES, None),
         (("unseen_camera",), FRAMES, "unseen"),
         (("unseen*",), FRAMES + 9, "unseen"),
+        (("contacts_*",), FRAMES, "contacts"),
+        (("contacts_grasps", "contacts_driving"), FRAMES, "contacts"),
+        (("contacts_grasp",), FRAMES, None),
         (("train",), FRAMES + 9, None),
         (("train", "test"), FRAMES + 9, None),
     ],
@@ -322,7 +325,8 @@ def test_only_splits_that_there_can_be_are_simulated(
     run: Run, splits: tuple[str, ...], frames: int, simulated: str | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     simulating = replace(run, config=toy.config())
-    monkeypatch.setattr(eval_clips, "_simulated", lambda what, make: "unseen" if "never seen" in what else "longer")
+    words = {"scenes": "unseen", "contacts": "contacts"}
+    monkeypatch.setattr(eval_clips, "_simulated", lambda what, make: words.get(what.split()[0].strip(","), "longer"))
     protocol = replace(find("paper", run.config), splits=splits, horizon=frames - 1)
     store = run.open_clips()
     assert evaluation_store(simulating, store, protocol) == (simulated or store)

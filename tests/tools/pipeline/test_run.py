@@ -74,7 +74,6 @@ def test_a_field_changes_the_keys_of_its_stage_and_of_all_after_it(field: str, v
 @pytest.mark.parametrize(
     ("field", "value"),
     [
-        ("sim.workers", 3),
         ("runtime.checkpoint_every", 9),
         ("runtime.sharding", "mesh"),
         ("train.accumulate", 2),

@@ -20,9 +20,7 @@ from rsjax.tools.sim.collect import CollectError, collect, collection_key
 from rsjax.tools.sim.episode import EpisodePlan, Simulators, run_episode
 from rsjax.tools.sim.lift import LiftSim
 
-CONFIG = SimConfig(
-    episodes=4, test_episodes=1, frames=4, tracks=20, seed=5, workers=1
-)  # a simulator takes seconds to start
+CONFIG = SimConfig(episodes=4, test_episodes=1, frames=4, tracks=20, seed=5)
 
 
 def plan(episode: int) -> EpisodePlan:
@@ -90,7 +88,7 @@ def test_collect_resumes_survives_a_killed_worker_and_packs(sim: LiftSim, tmp_pa
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        collect(CONFIG, out, interrupt_after_one)
+        collect(CONFIG, out, interrupt_after_one, workers=1)  # a simulator takes seconds to start
     kept = list(partial.glob("*.clip"))
     assert kept
     assert not out.exists()
@@ -108,7 +106,7 @@ def test_collect_resumes_survives_a_killed_worker_and_packs(sim: LiftSim, tmp_pa
         for child in multiprocessing.active_children() if len(seen) == 2 else ():
             child.kill()
 
-    collect(CONFIG, out, kill_at_once)
+    collect(CONFIG, out, kill_at_once, workers=1)
     assert seen[0] >= 1
     assert seen[-1] == 4
     assert not partial.exists()
@@ -243,8 +241,8 @@ def test_an_episode_that_kills_two_workers_stops_and_keeps_the_others(
         settle(items[0], WorkerDied())
 
     monkeypatch.setattr(collect_module, "run_items", run_items)
-    with pytest.raises(CollectError, match=r"died over episode 0.*fewer sim.workers \(now 1\)"):
-        collect(CONFIG, tmp_path / "lift", lambda done, total: None)
+    with pytest.raises(CollectError, match=r"died over episode 0.*fewer runtime.workers \(now 1\)"):
+        collect(CONFIG, tmp_path / "lift", lambda done, total: None, workers=1)
     assert (tmp_path / "lift.partial").exists()
 
 

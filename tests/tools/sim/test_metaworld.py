@@ -136,7 +136,7 @@ def test_a_camera_that_turns_keeps_looking_at_the_same_point(sim: LiftSim) -> No
 def test_stores_of_seen_and_unseen_clips(gl: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("metaworld", reason="Meta-World is not installed")
 
-    def simulate(config: SimConfig, partial: Path, todo: list[EpisodePlan], total: int, report: object) -> None:
+    def simulate(config: SimConfig, partial: Path, todo: list[EpisodePlan], *_: object) -> None:
         simulators = Simulators(config)
         for plan in todo:
             collect_module._work(simulators, config, partial, plan)

@@ -13,10 +13,11 @@ from rsjax.tools.sim import retakes
 from rsjax.tools.sim.collect import Collection, Report
 from rsjax.tools.sim.episode import EpisodePlan, Replay, run_episode, source_name
 from rsjax.tools.sim.lift import LiftSim
+from rsjax.tools.sim.recipes.plans import scripted
 from rsjax.tools.sim.retakes import collect_second_takes
 from rsjax.tools.sim.unseen import UNITS
 
-CONFIG = SimConfig(episodes=4, test_episodes=2, frames=4, tracks=20, seed=5, workers=1)
+CONFIG = SimConfig(episodes=4, test_episodes=2, frames=4, tracks=20, seed=5)
 
 
 def ignore(done: int, total: int) -> None:
@@ -31,7 +32,7 @@ def store(sim: LiftSim, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Stor
     meta |= {"key": "clips", "source": source_name(CONFIG), "config": to_dict(CONFIG)}
     write_store(tmp_path / "lift", "clips", {"test": (encode_clip(run_episode(sim, CONFIG, p)) for p in plans)}, meta)
 
-    def make(what: Collection, out: Path, report: Report) -> None:
+    def make(what: Collection, out: Path, report: Report, workers: int) -> None:
         clips = {
             split: (encode_clip(run_episode(sim, what.config, p)) for p in of) for split, of in what.splits.items()
         }
@@ -67,6 +68,16 @@ def test_second_takes_start_alike_and_move_a_little_otherwise(store: Store) -> N
         "split": "test",
         "jitter": retakes.JITTER,
     }
+
+
+def test_second_takes_of_paired_clips_do_not_take_each_others_place(sim: LiftSim, store: Store) -> None:
+    pair = [scripted(CONFIG, "grasps", place, f"pair-{place}") for place in range(2)]
+    assert pair[0].episode == pair[1].episode
+    clips = [encode_clip(run_episode(sim, CONFIG, plan)) for plan in pair]
+    write_store(store.path, "clips", {"pair": iter(clips)}, store.manifest)
+    takes = collect_second_takes(open_store(store.path), "pair", [1, 0], 1, ignore)
+    assert [take["provenance"]["expert"] for take in takes] == [clip["provenance"]["expert"] for clip in clips[::-1]]
+    assert [take["provenance"]["difficulty"] for take in takes] == ["difficult"] * 2
 
 
 def test_clips_of_another_simulator_or_of_none_are_refused(

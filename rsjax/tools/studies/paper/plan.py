@@ -7,6 +7,7 @@ from typing import Literal
 
 from rsjax.config import ComponentConfig, Config, ConfigError, CurriculumStageConfig, SimConfig, metaworld, presets
 from rsjax.config.config_fields import config_fields, with_values
+from rsjax.config.sim import EXPERT
 from rsjax.tools.pipeline.run import Run
 from rsjax.tools.sim import expert
 from rsjax.tools.studies.ablation.grid import OTHER_SEEDS, SEED, Value, cell_name
@@ -239,4 +240,4 @@ def _simple_share(sim: SimConfig) -> float:
     tasks = sim.train_tasks
     if tasks:
         return sum(task in metaworld.SIMPLE for task in tasks) / len(tasks)
-    return sum(expert.MODES[mode] for mode in expert.SIMPLE)
+    return sim.shares.get(EXPERT, 0.0) * sum(expert.MODES[mode] for mode in expert.SIMPLE)

@@ -1,0 +1,1 @@
+"""What the training episodes of Lift show, by name."""

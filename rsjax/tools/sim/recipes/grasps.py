@@ -1,0 +1,75 @@
+"""Paired grasps: the same start and approach, then fingers that close at several distances from the cube.
+
+The position of the fingers alone decides whether a grasp succeeds, since the episodes of a group share everything else:
+start, speed, noise, and what follows the closing.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rsjax.tools.sim.expert import CLOSE, OPEN
+from rsjax.tools.sim.recipes.script import Moves, Scripted, See, go, hover, stay
+
+# Distances from the cube's centre at which the fingers close, metres: an interval for each episode of a group.
+BESIDE = ((0.0, 0.018), (0.02, 0.03), (0.03, 0.04), (0.04, 0.055))
+ABOVE = ((0.0, 0.018), (0.019, 0.027), (0.027, 0.036), (0.036, 0.06))
+GROUP = len(BESIDE)
+ABOVE_SHARE = 0.25  # of the groups; the others close beside the cube
+
+
+@dataclass(frozen=True)
+class GraspManner:
+    """A grasp; lengths in metres, times in control steps.
+
+    Attributes:
+        hover: height above the cube's centre at which the episodes of a group part.
+        offset: from the cube's centre at that moment to the point where the fingers close.
+        speed, noise, delay, squeeze: as in :class:`rsjax.tools.sim.expert.Manner`.
+        carry: displacement after the fingers have closed.
+    """
+
+    mode: str
+    hover: float
+    offset: tuple[float, float, float]
+    speed: float
+    noise: float
+    delay: int
+    squeeze: int
+    carry: tuple[float, float, float]
+
+    def expert(self, rng: np.random.Generator) -> Scripted:
+        """Returns the policy of an episode; ``rng`` draws the noise."""
+        return Scripted(self, self.moves, (self.noise, 0.02), rng)
+
+    def moves(self, see: See) -> Moves:
+        """Approaches, parts from the group, closes and lifts."""
+        yield from stay(OPEN, self.delay)
+        yield from hover(see, np.array([0, 0, self.hover]), self.speed, steps=24)
+        point = see().cube + np.array(self.offset)
+        yield from go(see, point, OPEN, self.speed, steps=14, near=0.007)
+        yield from go(see, point, CLOSE, self.speed, self.squeeze)
+        yield from go(see, point + np.array(self.carry), CLOSE, self.speed, steps=60)
+
+
+def grasps(rng: np.random.Generator, number: int) -> GraspManner:
+    """Draws a group of grasps, and returns one of it: its ``offset`` alone depends on the episode's number."""
+    angle = rng.uniform(0, 2 * np.pi)
+    if rng.random() < ABOVE_SHARE:
+        intervals = np.array(ABOVE)
+        direction = np.array([0, 0, 1])
+    else:
+        intervals = np.array(BESIDE)
+        direction = np.array([np.cos(angle), np.sin(angle), 0])
+    distances = rng.uniform(intervals[:, 0], intervals[:, 1])
+    x, y, z = distances[number % GROUP] * direction
+    return GraspManner(
+        mode="grasps",
+        hover=float(rng.uniform(0.06, 0.1)),
+        offset=(float(x), float(y), float(z) - 0.004),
+        speed=float(rng.uniform(0.75, 1.0)),
+        noise=float(rng.uniform(0.0, 0.1)),
+        delay=int(rng.integers(0, 4)),
+        squeeze=int(rng.integers(5, 8)),
+        carry=(float(rng.uniform(-0.04, 0.1)), float(rng.uniform(-0.1, 0.1)), float(rng.uniform(0.1, 0.2))),
+    )

@@ -1,0 +1,61 @@
+"""Recorded policies, and the recipe that simulates their episodes once more."""
+
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rsjax.config import SimConfig
+from rsjax.errors import UserError
+from rsjax.tools.policies.studies.recording import record
+from rsjax.tools.policies.worlds.simulator_world import SimulatorWorld
+from rsjax.tools.sim.episode import run_episode
+from rsjax.tools.sim.recipes.plans import training_plans
+from tests.tools.policies.toy import demo_store
+
+CONFIG = SimConfig(episodes=5, test_episodes=1, frames=3, tracks=20, seed=5, camera="near", control_steps=2)
+
+
+class Drawn:
+    """A policy that draws its actions."""
+
+    def __init__(self, seed: int) -> None:
+        self.seed = seed
+
+    def actor(self, seed: int) -> Any:
+        rng = np.random.default_rng([self.seed, seed])
+        return lambda observation: rng.uniform(-1, 1, (len(observation["rgb"]), 14)).astype(np.float32)
+
+
+def test_what_a_policy_did_is_simulated_again(gl: str, tmp_path: Path) -> None:
+    policies: Any = {"bad": Drawn(0), "worse": Drawn(1)}
+    with closing(SimulatorWorld.lift(CONFIG, 2)) as world:
+        store = record(policies, world, CONFIG, 2, tmp_path)
+        again = record(policies, world, CONFIG, 2, tmp_path)
+        assert store.path == again.path == tmp_path / store.manifest["key"]
+        assert [place.name for place in tmp_path.iterdir()] == [store.path.name]
+        recorded = [store.source("train")[number] for number in range(4)]
+        assert [each["provenance"]["policy"] for each in recorded] == ["bad", "bad", "worse", "worse"]
+        np.testing.assert_array_equal(recorded[0]["rgb"][0], recorded[2]["rgb"][0])
+        mix = replace(CONFIG, episodes=6, recipe=(f"recorded:{store.path}",))
+        plans = training_plans(mix)
+        assert len({plan.episode for plan in plans}) == 2, "five episodes of two starts"
+        for plan, episode in zip((plans[1], plans[4]), (recorded[1], recorded[0]), strict=True):
+            clip = run_episode(world.simulators[0], mix, plan)
+            for name in ("rgb", "depth", "actions", "success"):
+                np.testing.assert_array_equal(getattr(clip, name), episode[name], err_msg=name)
+            assert clip.provenance["expert"]["policy"] == "bad"
+            assert np.isfinite(clip.tracks).all()
+    with pytest.raises(UserError) as refused:
+        training_plans(replace(mix, frames=9))
+    assert "episodes of 3 frames and 14 numbers an action; sim.frames 9" in str(refused.value)
+
+
+def test_clips_that_no_policy_made_are_no_recordings(tmp_path: Path) -> None:
+    store = demo_store(tmp_path / "demos")
+    with pytest.raises(UserError) as refused:
+        training_plans(replace(CONFIG, recipe=(f"recorded:{store.path}",)))
+    assert "do not say from which start they are; make it with experiments.record" in str(refused.value)

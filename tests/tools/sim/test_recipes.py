@@ -1,0 +1,139 @@
+"""What the training episodes of Lift show."""
+
+from collections import Counter
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rsjax.config import SimConfig
+from rsjax.config.sim import EXPERT
+from rsjax.config.sim import RECIPES as NAMES
+from rsjax.data.store import encode_clip, open_store
+from rsjax.tools.sim.collect import collect, collection_key
+from rsjax.tools.sim.contacts import collect_contacts, contact_splits
+from rsjax.tools.sim.episode import EpisodePlan, clip_seed, run_episode
+from rsjax.tools.sim.expert import OPEN, State
+from rsjax.tools.sim.lift import REACH, STEP, LiftSim
+from rsjax.tools.sim.recipes.grasps import GROUP
+from rsjax.tools.sim.recipes.plans import RECIPES, held_out_plans, scripted, training_plans
+
+CONFIG = SimConfig(episodes=24, test_episodes=4, frames=3, tracks=20, seed=5)
+MIX = replace(CONFIG, recipe=("expert=2", "grasps=2", "driving=1"))
+STEPS = 60  # control steps of a clip of 16 frames
+
+
+def play(sim: LiftSim, plan: EpisodePlan) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Returns an episode's actions, the gripper's positions before them, and success after them."""
+    assert plan.manner is not None
+    rng = np.random.default_rng([CONFIG.seed, plan.episode])
+    sim.reset(int(rng.integers(2**32)))
+    expert = plan.manner.expert(rng)
+    actions, gripper, success = [], [], []
+    for _ in range(STEPS):
+        gripper.append(sim.state.gripper)
+        actions.append(expert.act(sim.state))
+        sim.step(actions[-1])
+        success.append(sim.success)
+    return np.array(actions), np.array(gripper), np.array(success)
+
+
+def test_the_configuration_names_the_recipes_that_there_are() -> None:
+    assert (EXPERT, *RECIPES) == NAMES
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_a_recipe_gives_clips_with_finite_labels_that_depend_on_the_seed_alone(sim: LiftSim, name: str) -> None:
+    plan = scripted(CONFIG, name, 1, "1")
+    clip = run_episode(sim, CONFIG, plan)
+    assert clip.rgb.shape == (3, 64, 64, 3) and clip.rgb.dtype == np.uint8
+    assert clip.depth is not None and clip.depth.shape == (3, 64, 64)
+    assert clip.actions.shape == (3, CONFIG.action_dim) and np.abs(clip.actions).max() <= 1
+    assert not clip.actions[0].any() and clip.actions[1:].any()
+    assert clip.tracks.shape == (20, 3, 2) and clip.visible.shape == (20, 3)
+    assert all(np.isfinite(labels).all() for labels in (clip.depth, clip.actions, clip.tracks))
+    assert clip.provenance["expert"]["mode"] == name and clip.provenance["difficulty"] == "difficult"
+    run_episode(sim, CONFIG, scripted(CONFIG, name, GROUP, "other"))
+    again = encode_clip(run_episode(sim, CONFIG, scripted(CONFIG, name, 1, "1")))
+    np.testing.assert_equal(again, encode_clip(clip))
+    other = run_episode(sim, CONFIG, scripted(replace(CONFIG, seed=6), name, 1, "1"))
+    assert not np.array_equal(other.actions, clip.actions)
+    rng = np.random.default_rng([CONFIG.seed, plan.episode])
+    assert clip_seed(clip.provenance) == int(rng.integers(2**32))
+
+
+def test_grasps_of_a_group_share_start_and_approach_and_about_half_succeed(sim: LiftSim) -> None:
+    plans = [scripted(CONFIG, "grasps", place, f"{place}") for place in range(12 * GROUP)]
+    success = []
+    for first in range(0, len(plans), GROUP):
+        manners = [asdict(plan.manner) for plan in plans[first : first + GROUP]]  # type: ignore[call-overload]
+        offsets = [manner.pop("offset") for manner in manners]
+        assert all(manner == manners[0] for manner in manners) and len(set(offsets)) == GROUP
+        played = [play(sim, plan) for plan in plans[first : first + GROUP]]
+        actions, gripper, lifted = (np.stack(each) for each in zip(*played, strict=True))
+        parted = np.flatnonzero((actions != actions[0]).any((0, 2)))[0]
+        np.testing.assert_array_equal(gripper[:, : parted + 1], gripper[:1, : parted + 1].repeat(GROUP, 0))
+        assert parted > 5 and (actions[:, : parted + 1, 6] == OPEN).all(), "they part before the fingers close"
+        success.append(lifted[:, -1])
+    rates = np.mean(success, 0)
+    assert 0.35 < rates.mean() < 0.65
+    assert rates[0] > 0.8 and rates[-1] < 0.4, "the nearest succeed and the farthest fail"
+
+
+def test_free_driving_reaches_all_edges_with_open_and_closed_fingers() -> None:
+    """Without physics: the gripper is where the actions send it."""
+    goals, fingers, toggled, reversed_ = [], [], 0, 0
+    for place in range(60):
+        plan = scripted(CONFIG, "driving", place, "x")
+        assert plan.manner is not None
+        expert = plan.manner.expert(np.random.default_rng(place))
+        goal = np.array([-0.1, 0.0, 1.0])
+        actions = []
+        for _ in range(STEPS):
+            actions.append(expert.act(State(goal, goal, 0.0, np.array([0, 0, 0.82]), 0.0)))
+            goal = np.clip(goal + STEP * actions[-1][:3], *REACH)
+            goals.append(goal)
+        rows = np.array(actions)
+        fingers += rows[:, 6].tolist()
+        toggled += (np.diff(rows[:, 6]) != 0).any()
+        reversed_ += (rows[:-4, :3] * rows[4:, :3] < -0.2).any()
+    assert (np.min(goals, 0) < REACH[0] + 0.02).all() and (np.max(goals, 0) > REACH[1] - 0.02).all()
+    assert 0.25 < np.mean(np.array(fingers) == OPEN) < 0.75
+    assert toggled > 30 and reversed_ > 20
+
+
+def test_the_recipes_take_turns_by_their_shares_and_never_meet_held_out_episodes() -> None:
+    plans = training_plans(MIX)
+    assert [plan.name for plan in plans] == [f"{number:06d}" for number in range(20)]
+    kinds = [plan.manner.mode if plan.manner else EXPERT for plan in plans]
+    assert Counter(kinds) == {EXPERT: 8, "grasps": 8, "driving": 4}
+    assert Counter(kinds[:10]) == {EXPERT: 4, "grasps": 4, "driving": 2}
+    assert [plan.episode for plan in plans if not plan.manner] == [n for n, k in enumerate(kinds) if k == EXPERT]
+    grasps = [plan.episode for plan in plans if plan.manner and plan.manner.mode == "grasps"]
+    assert sorted(Counter(grasps).values()) == [GROUP, GROUP], "groups are whole"
+    held_out = {plan.episode for name in RECIPES for plan in held_out_plans(MIX, name, 50)}
+    assert not held_out & {plan.episode for name in RECIPES for plan in training_plans(replace(MIX, recipe=(name,)))}
+
+
+def test_the_default_keeps_its_episodes_and_another_recipe_has_another_key() -> None:
+    assert training_plans(CONFIG) == tuple(EpisodePlan(f"{number:06d}", number) for number in range(20))
+    assert collection_key(MIX) != collection_key(CONFIG)
+    assert collection_key(replace(CONFIG, recipe=("expert",))) == collection_key(CONFIG)
+
+
+def test_a_mix_has_the_test_clips_of_the_expert_and_held_out_contacts(sim: LiftSim, tmp_path: Path) -> None:
+    config = replace(CONFIG, episodes=3, test_episodes=1, frames=2, recipe=("grasps", "driving"))
+    collect(config, tmp_path / "mix", lambda done, total: None, workers=1)
+    store = open_store(tmp_path / "mix")
+    assert store.manifest["modes"].keys() >= {"grasps", "driving"}
+    (test,) = map(store.source("test").__getitem__, range(1))
+    expected = encode_clip(run_episode(sim, replace(config, recipe=(EXPERT,)), EpisodePlan("000002", 2)))
+    for record in (test, expected):
+        record["provenance"].pop("depth_range", None)  # of the training clips
+    np.testing.assert_equal(test, expected)
+    contacts = collect_contacts(config, store, 1, lambda done, total: None, workers=1)
+    assert contacts.splits == contact_splits(config) == tuple(f"contacts_{name}" for name in RECIPES)
+    assert contacts.manifest["depth_range"] == store.manifest["depth_range"]
+    assert [contacts.source(split)[0]["provenance"]["expert"]["mode"] for split in contacts.splits] == list(RECIPES)
+    assert not contact_splits(replace(config, env="metaworld", camera="near", recipe=(EXPERT,)))
