@@ -115,10 +115,10 @@ def probes_of(run: Run, store: Store, eval_clips: EvaluationClips) -> Probes | U
         return Unavailable(
             f"{protocol.clips} clips are scored; grasps and drives are simulated where {LEAST_CLIPS} or more are"
         )
-    config = from_dict(SimConfig, store.manifest["config"] | {"workers": run.config.sim.workers})
+    config = from_dict(SimConfig, store.manifest["config"])
     with Progress("simulating grasps and drives", 0, "episodes") as progress:
         try:
-            return collect_probes(config, store, _report_to(progress))
+            return collect_probes(config, store, _report_to(progress), run.config.runtime.workers)
         except UserError as error:  # such as a machine without OpenGL; the other metrics do not need it
             note(f"no grasps and drives: {first_line(error)}")
             return Unavailable(first_line(error))

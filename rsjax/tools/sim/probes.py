@@ -38,6 +38,7 @@ def collect_probes(
     config: SimConfig,
     clips: Store,
     report: Report,
+    workers: int = 0,
     grasps: Sequence[EpisodePlan] = GRASPS,
     drives: Sequence[EpisodePlan] = DRIVES,
 ) -> Probes:
@@ -47,6 +48,9 @@ def collect_probes(
         config: the configuration of ``clips``.
         clips: the store that training reads; the probes are kept in its directory.
         report: called as episodes finish, of both kinds.
+        workers: processes that simulate; 0: one per core.
+        grasps: the episodes of grasps.
+        drives: the episodes of drives, all of one length.
 
     Raises:
         UserError: as :func:`rsjax.tools.sim.collect.collect`, or the simulator fails on a probe.
@@ -54,20 +58,26 @@ def collect_probes(
     total = len(grasps) + len(drives)
     length = -(-STEPS // config.control_steps) + 1
     return Probes(
-        _collected(config, clips, "grasps", grasps, length, lambda done, _: report(done, total)),
-        _collected(config, clips, "drives", drives, FRAMES, lambda done, _: report(len(grasps) + done, total)),
+        _collected(config, clips, "grasps", grasps, length, lambda done, _: report(done, total), workers),
+        _collected(config, clips, "drives", drives, FRAMES, lambda done, _: report(len(grasps) + done, total), workers),
     )
 
 
 def _collected(
-    config: SimConfig, clips: Store, split: str, plans: Sequence[EpisodePlan], frames: int, report: Report
+    config: SimConfig,
+    clips: Store,
+    split: str,
+    plans: Sequence[EpisodePlan],
+    frames: int,
+    report: Report,
+    workers: int,
 ) -> list[Record]:
     seed = (config.seed + SEED) % 2**32
     config = replace(config, frames=frames, seed=seed, tracks=1, track_points="grid")
     key = content_key(FOLDER, RECIPE, split, collection_key(config), tuple(plans))
     meta: dict[str, Any] = {name: clips.manifest[name] for name in UNITS} | {"probes_of": clips.manifest.get("key")}
     out = clips.path / FOLDER / key
-    make_store(Collection(key, config, {split: tuple(plans)}, meta), out, report)
+    make_store(Collection(key, config, {split: tuple(plans)}, meta), out, report, workers)
     made = open_store(out).source(split)
     if len(made) < len(plans):
         raise UserError(f"{out}: the simulator failed on {len(plans) - len(made)} of {len(plans)} {split}")
