@@ -91,16 +91,14 @@ def split(options: Split) -> list[Any]:
 def tokenize(options: Tokenize) -> list[Any]:
     """Makes the store of tokens next to the clips, and returns it."""
     tune_process()
-    from rsjax.data.normalization import Normalization
     from rsjax.data.store import open_store
-    from rsjax.models.base import Assets, create_model
-    from rsjax.models.load_run import load_config, load_tokenizer
+    from rsjax.models.load_run import load_config
+    from rsjax.tools.pipeline.prepared import prepare_store
 
     config = load_config(options.run)
     clips = open_store(options.store)
-    assets = Assets(Normalization.create(clips), load_tokenizer(config, options.run))  # normalization of these clips
-    prepared = create_model(config).prepare(clips, assets, options.store / "tokens", config.runtime.max_damaged)
-    if prepared is None:
+    prepared = prepare_store(options.run, config, clips)
+    if prepared is clips:
         raise ConfigError(f"{options.run}: a model of family {config.model.family!r} has no tokens")
     return [prepared]
 

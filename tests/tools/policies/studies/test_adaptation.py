@@ -1,0 +1,153 @@
+"""A whole adaptation of ``debug`` through its command: once, killed and resumed, with a second round, and refused."""
+
+import json
+import shutil
+import signal
+from contextlib import closing
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+from rsjax.data.store import open_store
+from rsjax.models.load_run import load
+from rsjax.tools.policies.config import toy
+from rsjax.tools.policies.judges.judge import HISTORY
+from rsjax.tools.policies.judges.judge_training import FOLDER
+from rsjax.tools.policies.judges.trained_judge import Network, TrainedJudge
+from rsjax.tools.policies.on_policy import FIRST_EPISODE
+from rsjax.tools.policies.policy_training import train_policy
+from rsjax.tools.policies.run_data import RunData
+from rsjax.tools.policies.worlds.simulator_world import SimulatorWorld
+from rsjax.tools.sim.episode import clip_seed
+from tests.tools.pipeline.conftest import Commands, command, debug, shared
+
+__all__ = ["command", "debug", "shared"]
+
+QUICK = ("--steps", 4, "--rollouts", 2, "--held-out", 2, "--trials", 2, "--max-steps", 7, "--together", 1)
+
+
+@dataclass(frozen=True)
+class Place:
+    """A run with a judge, a policy, and the result of a whole adaptation; only for reading."""
+
+    run: Path
+    policy: Path
+    out: Path
+
+
+def done(command: Commands, *words: object) -> str:
+    """Returns what the command prints, run in a process of its own."""
+    ended = command("experiments.adapt", *words)
+    assert ended.returncode == 0, ended.stderr
+    return ended.stdout
+
+
+@pytest.fixture(scope="module")
+def place(debug: Path, command: Commands, tmp_path_factory: pytest.TempPathFactory) -> Place:
+    folder = tmp_path_factory.mktemp("adapt")
+    run = shutil.copytree(debug, folder / "run")
+    params = Network().init(jax.random.key(0), np.zeros((1, HISTORY, 64, 64, 3), np.uint8))["params"]
+    TrainedJudge(params, 1.0, 64).save(run / FOLDER)
+    config = toy()
+    demos = RunData(run, command.data).demos("all")
+    train_policy(replace(config, train=replace(config.train, steps=1)), demos, folder / "policy")
+    done(command, run, "--policy", folder / "policy", *QUICK, "--out", folder / "out")
+    return Place(run, folder / "policy", folder / "out")
+
+
+def results(out: Path) -> dict[str, Any]:
+    """The results without the place where they lie."""
+    content: dict[str, Any] = json.loads((out / "results.json").read_text().replace(str(out), "OUT"))
+    return content
+
+
+def test_the_adapted_run_is_a_run_that_began_with_the_weights_and_both_kinds_of_clips(
+    place: Place, command: Commands
+) -> None:
+    adapted = load(place.out / "round-1")
+    before = load(place.run)
+    jax.tree.map(np.testing.assert_array_equal, adapted.assets.tokenizer, before.assets.tokenizer)
+    assert (place.out / "round-1" / "tokens" / "store").resolve() == (place.run / "tokens" / "store").resolve()
+    (stage,) = adapted.config.train.curriculum
+    own, new = stage.components
+    assert own.store == "" and own.weight == new.weight == 0.5
+    tokens = open_store(new.store)
+    assert tokens.path.is_relative_to(place.out / "on-policy-1") and tokens.counts() == {"train": 4, "test": 4}
+    log = [json.loads(row) for row in (place.out / "round-1" / "world_model" / "log.jsonl").read_text().splitlines()]
+    assert log[-1]["step"] == 4
+    assert (place.out / "round-1" / "report.html").exists() and (place.out / "round-1" / FOLDER).exists()
+    assert "round-1" in command.here("experiments.evaluate", place.out / "round-1", "--protocol", "run")
+
+
+def test_the_clips_are_what_the_policy_did(place: Place, command: Commands) -> None:
+    data = RunData(place.run, command.data)
+    episodes = open_store(place.out / "on-policy-1" / "episodes").source("test")
+    with closing(SimulatorWorld.lift(data.simulator, 1)) as world:
+        for number in range(2):
+            record = episodes[number]
+            seed = clip_seed({"seed": data.simulator.seed, "episode": FIRST_EPISODE + number})
+            state = world.reset([seed])
+            np.testing.assert_array_equal(record["rgb"][0], state.observation["rgb"][0])
+            for frame, row in enumerate(record["actions"][1:], 1):
+                state = world.step(row[None])
+                np.testing.assert_array_equal(record["rgb"][frame], state.observation["rgb"][0])
+    assert len(record["rgb"]) == 8
+
+
+def test_scores_and_success_are_reported_before_and_after(place: Place) -> None:
+    found = results(place.out)
+    assert [row["name"] for row in found["models"]] == ["before", "round-1"]
+    for row in found["models"]:
+        scores = json.loads((Path(row["run"].replace("OUT", str(place.out))) / "metrics.json").read_text())
+        assert row["own"]["psnr"] == scores["psnr"] and row["on_policy"]["clips"] == 2
+    before, after = found["models"]
+    for kind in ("own", "on_policy"):
+        assert before[kind]["gain"]["value"] == 0
+        assert after[kind]["gain"]["value"] == pytest.approx(after[kind]["psnr"] - before[kind]["psnr"])
+    assert [row["run"] for row in found["success"]] == ["before", "round-1"]
+    text = (place.out / "results.md").read_text()
+    assert "| round-1 " in text and "same outcome" in text
+
+
+def test_killed_twice_and_run_again_it_gives_the_same_bytes_and_a_second_round_goes_on(
+    place: Place, command: Commands, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    words = (place.run, "--policy", place.policy, *QUICK, "--out", out)
+    for where in ("rollouts", "world_model"):
+        killed = command("tests.tools.policies.killed", where, *words)
+        assert killed.returncode == -signal.SIGKILL, killed.stderr
+    done(command, *words)
+    for file in ("on-policy-1/clips/train-00000.array_record", "on-policy-1/clips/test-00000.array_record"):
+        assert (out / file).read_bytes() == (place.out / file).read_bytes()
+    jax.tree.map(np.testing.assert_array_equal, load(out / "round-1").params, load(place.out / "round-1").params)
+    assert results(out) == results(place.out)
+
+    printed = done(command, *words, "--rounds", 2)
+    assert "| round-2 " in printed
+    more = results(out)
+    assert more["models"][:2] == results(place.out)["models"]
+    config = load(out / "round-2").config
+    assert config.train.start_from == str(out / "round-1")
+    assert [part.weight for part in config.train.curriculum[0].components] == [0.5, 0.25, 0.25]
+    line = command.refused("experiments.adapt", *words, "--share", 0.4)
+    assert "holds an adaptation of another run, to other policies or episodes, or with other settings" in line
+
+
+def test_recorded_episodes_serve_as_well(place: Place, command: Commands, tmp_path: Path) -> None:
+    store = place.out / "on-policy-1" / "episodes"
+    words = ("--episodes", store, "--minutes", 0.001, "--out", tmp_path / "out")
+    assert "minutes are" in done(command, place.run, *words)
+    found = results(tmp_path / "out")
+    assert "success" not in found and found["steps"] >= 1
+    assert found["models"][0]["on_policy"] == results(place.out)["models"][0]["on_policy"]
+    for bad, wrong in (
+        ((), "name policies with --policy DIR, recorded episodes with --episodes STORE, or both"),
+        (("--episodes", store, "--share", 1), "--share is 1.0"),
+        (("--episodes", store, "--rounds", 3), "--rounds is 3; it is 1 or 2"),
+    ):
+        assert wrong in command.refused("experiments.adapt", place.run, *bad)
