@@ -11,6 +11,8 @@ from experiments.cli import main_errors, parse_options
 from rsjax.config import ConfigError
 from rsjax.runtime import tune_process
 
+FIRST = 1_000_000  # number of the first episode; those of experiments.adapt are smaller
+
 
 @dataclass(frozen=True)
 class Options:
@@ -19,7 +21,7 @@ class Options:
     run: tyro.conf.Positional[Path] = tyro.MISSING
     """A run directory on simulated clips, whose camera, frames and control steps the recordings have."""
     policies: tuple[Path, ...] = ()
-    """Directories of trained policies, such as RUN/policy_evaluation/policy/at-90; all start from the same states."""
+    """Directories of trained policies, such as RUN/policy_evaluation/policy/at-90; they take turns."""
     episodes: int = 25
     """Episodes of each policy."""
     together: int = 5
@@ -37,18 +39,23 @@ def main() -> None:
     options = parse_options(sys.argv[1:], "python -m experiments.record", Options.__doc__ or "", Options())
     if not options.policies or options.episodes < 1 or options.together < 1:
         raise ConfigError("name a policy at least, and --episodes and --together of 1 or more: --policies DIR")
+    from rsjax.config import content_key
+    from rsjax.tools.policies.on_policy import rollouts
     from rsjax.tools.policies.policy import common_size, load_policy
     from rsjax.tools.policies.run_data import RunData, named
-    from rsjax.tools.policies.studies.recording import record
     from rsjax.tools.policies.worlds.simulator_world import SimulatorWorld
 
     config = RunData(options.run, options.data_dir).simulator
     policies = {name: load_policy(place) for name, place in named(options.policies).items()}
     common_size(policies.values())
+    total = options.episodes * len(policies)
+    numbers = {"train": range(FIRST, FIRST + total)}
+    keys = str([policy.key for policy in policies.values()])
+    folder = (options.out or options.run / "recorded") / content_key("recorded", config, keys, total)
     with closing(SimulatorWorld.lift(config, min(options.together, options.episodes))) as world:
-        store = record(policies, world, config, options.episodes, options.out or options.run / "recorded")
+        store = rollouts(policies, world, config, numbers, config.frames - 1, folder, "record")
     share = store.manifest["success_share"]
-    print(f"{len(store.source('train'))} episodes, {100 * share:.0f} % end in success")
+    print(f"{total} episodes, {100 * share:.0f} % end in success")
     print(f"--sim.recipe expert recorded:{store.path}")
 
 

@@ -25,7 +25,7 @@ from rsjax.progress import Progress
 from rsjax.tools.policies.policy import Policy
 from rsjax.tools.policies.worlds.world import World
 from rsjax.tools.sim.collect import Collection, make_store
-from rsjax.tools.sim.episode import EpisodePlan, Replay, clip_seed
+from rsjax.tools.sim.episode import POLICY, EpisodePlan, Replay, clip_seed
 from rsjax.tools.sim.unseen import UNITS
 
 FIRST_EPISODE = 2**20  # the numbers of a run's own episodes are smaller, so none starts like one of these
@@ -72,7 +72,9 @@ def rollouts(
     folder: Path,
     name: str,
 ) -> Store:
-    """Makes a store of whole episodes of policies in the simulator.
+    """Makes a store of whole episodes of policies in the simulator, ``folder/episodes``.
+
+    An interrupted call resumes. The recipe ``recorded:PATH`` takes such a store (docs/simulators.md).
 
     Args:
         world: the simulator of ``config``.
@@ -92,7 +94,9 @@ def rollouts(
             title = f"{name}: {policy_name} in the simulator, {split}"
             made = act(policy, world, seeds, steps, folder / "actions" / split / policy_name, title)
             for episode, actions in zip(mine, made, strict=True):
-                found[episode] = EpisodePlan(f"{split}-{episode:07d}", episode, replay=Replay(actions, 0.0))
+                manner = {"mode": POLICY, "policy": policy_name}
+                replay = Replay(actions, 0.0, manner)
+                found[episode] = EpisodePlan(f"{split}-{episode:07d}", episode, replay=replay)
         plans[split] = tuple(found[episode] for episode in sorted(found))
     sim = replace(config, frames=steps + 1)
     keys = [policy.key for policy in policies.values()]

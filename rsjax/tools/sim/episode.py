@@ -18,6 +18,8 @@ from rsjax.tools.sim.render import Camera, View
 from rsjax.tools.sim.scenery import SEEN, Change, Variation, draw_variation
 from rsjax.tools.sim.tracks import Snapshot, grid_pixels, object_pixels, track
 
+POLICY = "policy"  # mode of an episode in which a trained policy acted
+
 
 class Expert(Protocol):
     """A scripted policy with the manner of one episode."""

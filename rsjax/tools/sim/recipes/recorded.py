@@ -13,7 +13,7 @@ from jaxtyping import Float, Float32
 from rsjax.config import SimConfig
 from rsjax.data.store import open_store
 from rsjax.errors import UserError
-from rsjax.tools.sim.episode import EpisodePlan
+from rsjax.tools.sim.episode import POLICY, EpisodePlan
 from rsjax.tools.sim.expert import State
 
 
@@ -93,9 +93,9 @@ def _episodes(store: Path) -> list[Episode]:
     source = open_store(store).source("train")
     episodes = []
     for record in map(source.__getitem__, range(len(source))):
-        start = record["provenance"].get("start")
-        if start is None:
-            raise UserError(f"{store}: its clips do not say from which start they are; make it with experiments.record")
-        policy = record["provenance"]["policy"]
-        episodes.append(Episode(start["seed"], start["episode"], policy, record["actions"]))
+        origin = record["provenance"]
+        manner = origin.get("expert")
+        if not isinstance(manner, dict) or manner.get("mode") != POLICY:
+            raise UserError(f"{store}: its clips are not of policies in the simulator; make it with experiments.record")
+        episodes.append(Episode(origin["seed"], origin["episode"], manner["policy"], record["actions"]))
     return episodes
