@@ -28,7 +28,7 @@ def tokens_key(clips: str, tokenizer: str) -> str:
         clips: content key of the clips.
         tokenizer: :func:`tokenizer_key`, which is also the name of the set's directory.
     """
-    return content_key("tokens, labelled with scenes", clips, tokenizer)
+    return content_key("tokens, labelled with scenes and success", clips, tokenizer)
 
 
 def token_sets(clips: Store) -> dict[str, Store]:

@@ -1,7 +1,8 @@
 """Tokenizes a store of clips, once for all runs with the same tokenizer.
 
 The tokens are in ``tokens/KEY`` of the store's directory and move with it. A token record is a clip's record with
-tokens instead of pixels; actions stay in the data's units. The manifest lists unreadable clips, which have no tokens.
+tokens instead of pixels, and without ``success`` if the data set does not record it; actions stay in the data's units.
+The manifest lists unreadable clips, which have no tokens.
 """
 
 import hashlib
@@ -20,6 +21,7 @@ from rsjax.data.codec import Record
 from rsjax.data.quarantine import NAME as QUARANTINE
 from rsjax.data.quarantine import Quarantine
 from rsjax.data.shift import moved
+from rsjax.data.state_labels import knows_success
 from rsjax.data.store import Store, StoreError, open_store, write_store
 from rsjax.data.token_sets import FOLDER, OWN, tokenizer_key, tokens_key
 from rsjax.files import lock_file, making
@@ -126,6 +128,7 @@ def _write(
     keys: dict[str, Any],
 ) -> None:
     total = sum(len(clips.source(split)) for split in clips.splits)
+    says_success = knows_success(clips)
     left_out: dict[str, list[int]] = {split: [] for split in clips.splits}
     with Progress("tokens", total, "clips") as progress:
         done = 0
@@ -136,7 +139,10 @@ def _write(
             missing = set(range(len(source)))
             for number, clip in readable(source, tell=lambda _: None):
                 missing.remove(number)
-                yield encode(clip) | (more(clip) if more and split == "train" else {})
+                record = encode(clip) | (more(clip) if more and split == "train" else {})
+                if says_success:
+                    record["success"] = clip["success"]
+                yield record
                 done += 1
                 progress.update(done)
             left_out[split] = sorted(missing)

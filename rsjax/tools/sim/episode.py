@@ -53,6 +53,10 @@ class Simulator(Protocol):
     @property
     def object_width(self) -> float: ...
     @property
+    def object_height(self) -> float: ...  # of the main object above the table
+    @property
+    def opening(self) -> float: ...  # between the gripper's fingers
+    @property
     def places(self) -> dict[str, Float[np.ndarray, " 3"]]: ...  # positions of main object and gripper, in this order
 
 
@@ -170,6 +174,8 @@ def run_episode(sim: Simulator, config: SimConfig, plan: EpisodePlan) -> Clip:
     shots = []
     success = []
     places = []
+    heights = []
+    openings = []
     actions = np.zeros((config.frames, config.control_steps, CONTROLS[config.env]), np.float32)
     for frame in range(config.frames):
         for step in range(config.control_steps if frame else 0):
@@ -179,13 +185,15 @@ def run_episode(sim: Simulator, config: SimConfig, plan: EpisodePlan) -> Clip:
         shots.append(Snapshot(sim.camera, *sim.body_poses(), views[-1].fine_depth))
         success.append(sim.success)
         places.append(sim.places)
+        heights.append(sim.object_height)
+        openings.append(sim.opening)
         if frame == 0:
             bodies = sim.segment()
             pixels = _track_pixels(config, sim, bodies, np.random.default_rng([seed, episode, 1]))
     tracks, visible = track(pixels, views[0].depth, bodies, shots)
     provenance = _origin(config, seed, episode) | {
         "expert": manner,
-        "objects": _in_the_image(shots[0].camera, places, sim.object_width),
+        "objects": _in_the_image(shots[0].camera, places, sim.object_width) | {"height": heights, "opening": openings},
         "versions": {name: importlib.metadata.version(name) for name in _packages(config)},
     }
     if plan.task:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int32
 
 from rsjax.tools.sim.base import MujocoSim, choose_camera
-from rsjax.tools.sim.expert import Expert, State, draw_manner
+from rsjax.tools.sim.expert import TABLE_HEIGHT, Expert, State, draw_manner
 from rsjax.tools.sim.gl import choose_gl
 from rsjax.tools.sim.render import Renderer
 from rsjax.tools.sim.scenery import SEEN, Scenery, Variation
@@ -137,6 +137,17 @@ class LiftSim(MujocoSim):
         """Returns where the object and the gripper are, in metres in the world."""
         state = self.state
         return {"cube": state.cube, "gripper": state.gripper}
+
+    @property
+    def object_height(self) -> float:
+        """Returns the height of the cube's centre above the table in metres."""
+        return float(self._data.xpos[self._cube_id][2]) - TABLE_HEIGHT
+
+    @property
+    def opening(self) -> float:
+        """Returns the distance between the gripper's fingers in metres, 0 if it is shut."""
+        left, right = self._data.qpos[self._env.robots[0]._ref_gripper_joint_pos_indexes]
+        return float(left - right)
 
     @property
     def object_width(self) -> float:

@@ -17,6 +17,7 @@ CONTROL_HZ = 80
 CENTRE = (0.0, 0.66, 0.1)  # of the workspace, metres
 # Our own camera, which sees no sky: position and the point it looks at in metres, vertical field of view in degrees.
 NEAR = ("near", (0.96, 0.07, 1.36), (0.0, 0.66, 0.13), 28.0)
+MOST_OPENING = 0.1  # metres between the fingers that Meta-World observes as 1, its greatest value
 OBJECT_WIDTH = 0.05  # metres, the size of a puck or handle; the unit for errors of the object's place
 STEPS = 10**9  # limit of an episode; after its own limit of 500 steps Meta-World raises an error
 
@@ -119,6 +120,16 @@ class MetaworldSim(MujocoSim):
     def places(self) -> dict[str, Float[np.ndarray, " 3"]]:
         """Returns where the main object and the gripper are, in metres in the world."""
         return {"object": np.array(self._env._get_pos_objects()[:3]), "gripper": np.array(self._env.tcp_center)}
+
+    @property
+    def object_height(self) -> float:
+        """Returns the height of the main object above the table in metres."""
+        return float(self._env._get_pos_objects()[2])
+
+    @property
+    def opening(self) -> float:
+        """Returns the distance between the gripper's fingers in metres, at most ``MOST_OPENING``."""
+        return MOST_OPENING * float(self.state[3])
 
     @property
     def object_width(self) -> float:
