@@ -53,11 +53,14 @@ class Video:
         rgb: frames, 0–255, RGB order, upright.
         depth: z-depth in metres; all NaN for a clip without depth. None: no clip has depth.
         tasks: the robot's task in each clip, in words; None: unknown.
+        state: a column for each of :data:`rsjax.data.state_labels.STATE`, NaN where unknown: of recorded clips the
+            labels, of generated ones what the model's state heads read, with the probability of success. None: neither.
     """
 
     rgb: UInt8[np.ndarray, "B T H W 3"]
     depth: Float32[np.ndarray, "B T H W"] | None = None
     tasks: Shaped[np.ndarray, " B"] | None = None
+    state: Float32[np.ndarray, "B T 3"] | None = None
 
     @property
     def has_depth(self) -> Bool[np.ndarray, " B"]:
@@ -72,10 +75,10 @@ class Video:
 
     def __getitem__(self, rows: Any) -> "Video":
         """Returns some of the clips: ``rows`` is an array of numbers, a mask or a slice."""
-        depth, tasks = (None if x is None else x[rows] for x in (self.depth, self.tasks))
-        return Video(self.rgb[rows], depth, tasks)
+        parts = (None if x is None else x[rows] for x in (self.depth, self.tasks, self.state))
+        return Video(self.rgb[rows], *parts)
 
     def frames(self, first: int, last: int | None = None) -> "Video":
         """Returns frames ``first`` to ``last`` - 1 of every clip."""
-        depth = None if self.depth is None else self.depth[:, first:last]
-        return Video(self.rgb[:, first:last], depth, self.tasks)
+        depth, state = (None if x is None else x[:, first:last] for x in (self.depth, self.state))
+        return Video(self.rgb[:, first:last], depth, self.tasks, state)

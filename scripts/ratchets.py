@@ -135,11 +135,11 @@ def matches_message(node: ast.AST) -> bool:
 
 
 def fields_of_tiny() -> int:
-    """Returns the number of settings of the main preset."""
+    """Returns the number of settings of the main preset, without sections that are off in it."""
     from rsjax.config import presets
     from rsjax.config.config_fields import config_fields
 
-    return len(config_fields(presets.get("tiny")))
+    return sum(field.value != "off" for field in config_fields(presets.get("tiny")).values())
 
 
 if __name__ == "__main__":

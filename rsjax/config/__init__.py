@@ -34,6 +34,7 @@ from rsjax.config.token_model import (
     RoboScapeConfig,
     SampleConfig,
     SmallDepthBranch,
+    StateHeadsConfig,
     TokenModelConfig,
     TransformerConfig,
 )
@@ -79,6 +80,7 @@ __all__ = [
     "SampleConfig",
     "SimConfig",
     "SmallDepthBranch",
+    "StateHeadsConfig",
     "TokenModelConfig",
     "TokenizerConfig",
     "TokenizerTrainConfig",

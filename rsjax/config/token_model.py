@@ -36,6 +36,28 @@ class PublicCodeConfig:
 
 
 @dataclass(frozen=True)
+class StateHeadsConfig:
+    """Heads that read success, the object's height and the gripper's opening from the network's features.
+
+    :mod:`rsjax.models.roboscape.departures.state_heads` defines them and their losses, of which a field ``NAME_weight``
+    weighs the loss NAME; 0 switches it off.
+    """
+
+    success_weight: float = 1.0
+    height_weight: float = 1.0
+    opening_weight: float = 1.0
+
+    def __post_init__(self) -> None:
+        names = ("success_weight", "height_weight", "opening_weight")
+        require_range(self, "model.state_heads", 0, math.inf, *names)
+        require(
+            bool(loss_weights(self)),
+            "model.state_heads is on, but all its weights are 0, so nothing would train the heads; set one above 0, or "
+            "state_heads to off",
+        )
+
+
+@dataclass(frozen=True)
 class Departures:
     """What the paper does not have. All are off by default; :mod:`rsjax.models.roboscape.departures` implements them.
 
@@ -260,6 +282,7 @@ class TokenModelConfig(TransformerConfig, ModelConfig):
     uses_tokenizer: ClassVar[bool] = True
     max_frames: int = 0
     corruption: CorruptionConfig | None = CorruptionConfig()  # off: models of few steps lose more than they gain
+    state_heads: StateHeadsConfig | None = None
     sample: SampleConfig = sampling(SampleConfig())
 
     @property
@@ -274,6 +297,13 @@ class TokenModelConfig(TransformerConfig, ModelConfig):
     def keypoint_term(self) -> str:
         """The keypoint term that the model trains with (:attr:`LossConfig.keypoints`); "none" also if λ₂ is 0."""
         return "none"
+
+    @property
+    def state_weights(self) -> dict[str, float]:
+        """The weights of the losses of the state heads by name; empty without heads."""
+        if self.state_heads is None:
+            return {}
+        return loss_weights(self.state_heads)
 
     def frames(self, clips: ClipShape) -> int:
         """Returns the number of positions in time for such clips."""
@@ -393,8 +423,8 @@ class RoboScapeConfig(TokenModelConfig):
         weights = {"rgb": 1.0} | {name: x for name, x in loss_weights(self.loss).items() if name not in off}
         if "attention" in weights and self.loss.attention == "normalised":
             # It takes the place of L_RGB, which is still logged.
-            return weights | {"rgb": 0.0, "attention": 1.0}
-        return weights
+            weights |= {"rgb": 0.0, "attention": 1.0}
+        return weights | self.state_weights
 
 
 @register_family("genie")
@@ -409,4 +439,4 @@ class GenieConfig(TokenModelConfig):
 
     @property
     def loss_weights(self) -> dict[str, float]:
-        return {"rgb": 1.0}
+        return {"rgb": 1.0} | self.state_weights

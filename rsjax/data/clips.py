@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float32, Int, UInt8
 
 from rsjax.clip import Video
 from rsjax.data.codec import Record
+from rsjax.data.state_labels import state_labels
 from rsjax.data.store import RecordSource, Store, StoreError
 from rsjax.progress import note
 
@@ -24,6 +25,7 @@ class Clips:
         index: each clip's number in the split.
         depth: zeros for clips without depth.
         has_depth: whether a clip has depth.
+        state: as of :func:`rsjax.data.state_labels.state_labels`.
         metric: whether a clip's depth is in metres rather than relative (see ``tools/ingest/annotators/depth.py``).
     """
 
@@ -36,6 +38,7 @@ class Clips:
     tracks: Float32[np.ndarray, "B N0 T 2"]
     visible: Bool[np.ndarray, "B N0 T"]
     success: Bool[np.ndarray, "B T"]
+    state: Float32[np.ndarray, "B T 3"]
     task: tuple[str, ...]
 
     @classmethod
@@ -53,20 +56,21 @@ class Clips:
             depth=np.stack([none if record["depth"] is None else record["depth"] for record in records]),
             has_depth=has,
             metric=has & np.array(metres),
+            state=np.stack([state_labels(record) for record in records]),
             task=tuple(record["task"] for record in records),
             **fields,
         )
 
     def first(self, frames: int) -> "Clips":
         """Returns the clips cut to their first frames."""
-        whole = {name: getattr(self, name)[:, :frames] for name in ("rgb", "depth", "actions", "success")}
+        whole = {name: getattr(self, name)[:, :frames] for name in ("rgb", "depth", "actions", "success", "state")}
         return replace(self, tracks=self.tracks[:, :, :frames], visible=self.visible[:, :, :frames], **whole)
 
     @property
     def video(self) -> Video:
         """Frames and depth; NaN in clips without depth."""
         if not self.has_depth.any():
-            return Video(self.rgb, tasks=np.array(self.task))
+            return Video(self.rgb, None, np.array(self.task), self.state)
         return self._video(self.has_depth)
 
     @property
@@ -76,7 +80,7 @@ class Clips:
 
     def _video(self, has_depth: Bool[np.ndarray, " B"]) -> Video:
         depth = np.where(has_depth[:, None, None, None], self.depth, np.float32(np.nan))
-        return Video(self.rgb, depth, np.array(self.task))
+        return Video(self.rgb, depth, np.array(self.task), self.state)
 
 
 def spread(source: Sized, count: int) -> list[int]:

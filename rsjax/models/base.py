@@ -51,10 +51,15 @@ class TeacherForced:
         cross_entropy: mean over a frame's cells of -log p of their tokens in nats (the sum over vocabularies), by
             branch; p is predicted with the whole frame masked. NaN for clips without this branch.
         accuracy: the share of a frame's cells whose most probable token is the true one, likewise.
+        features: the network's features of the masked frame, as the mean over its cells: what it knows of the frames
+            before and the action into this one; None for a family that returns none.
+        state: what the state heads read from them, as in :attr:`rsjax.clip.Video.state`; None without heads.
     """
 
     cross_entropy: dict[str, Float[np.ndarray, "B P"]]
     accuracy: dict[str, Float[np.ndarray, "B P"]]
+    features: Float[np.ndarray, "B P C"] | None = None
+    state: Float[np.ndarray, "B P 3"] | None = None
 
 
 class Imagination(Protocol):

@@ -44,6 +44,10 @@ class BranchState:
         memory: in a form that only the family knows; None if it was used up.
         size: bytes of the part of the memory that :meth:`Branching.lightened` leaves out.
         means: the mean codes by branch that the frame is decoded from, (S, D); if empty, it is decoded from its tokens.
+        features: what the model knows of the frame before it sees any of its cells, from the frames before and the
+            action: the mean over its cells (:attr:`rsjax.models.base.TeacherForced.features`); None for a first frame
+            or a family that has none.
+        state: what the model's state heads read (a column of :attr:`rsjax.clip.Video.state`); None without heads.
     """
 
     rgb: UInt8[np.ndarray, "H W 3"]
@@ -52,6 +56,8 @@ class BranchState:
     memory: Any
     size: int = 0
     means: dict[str, Float32[np.ndarray, "S D"]] = field(default_factory=dict)
+    features: Float32[np.ndarray, " C"] | None = None
+    state: Float32[np.ndarray, " K"] | None = None
 
 
 class Branching(Protocol):

@@ -164,4 +164,5 @@ class TrainedModel:
 
 
 def _first(video: Video) -> Video:
-    return Video(video.rgb[0], None if video.depth is None else video.depth[0])
+    depth, state = (None if x is None else x[0] for x in (video.depth, video.state))
+    return Video(video.rgb[0], depth, state=state)

@@ -18,7 +18,6 @@ from rsjax.data.clips import Clips
 from rsjax.data.normalization import Normalization
 from rsjax.devices import replicate
 from rsjax.evaluation.generation import teacher_forced
-from rsjax.evaluation.protocols import of_run
 from rsjax.models.base import Assets
 from rsjax.models.ivideogpt import autoencoder, rollout
 from rsjax.models.ivideogpt.model import IVideoGPT
@@ -55,9 +54,9 @@ def teacher_forcing() -> None:
         trained, source = toy.trained(store), store.source("test")
         clips = Clips.stacked([source[i] for i in range(3)], range(3))
     config = replace(trained.config, eval=replace(trained.config.eval, batch_size=1))
-    taught = teacher_forced(
-        replace(trained, config=config, params=replicate(trained.params)), of_run(config), clips.first(3)
-    )
+    some = clips.first(3)
+    model = replace(trained, config=config, params=replicate(trained.params))
+    taught = teacher_forced(model, config.prompt_frames, some.video, some.actions)
     assert taught is not None
     assert taught.accuracy["rgb"].shape == (3, 2)
 

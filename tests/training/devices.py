@@ -3,13 +3,13 @@
 Prints, as JSON, how far the world model's parameters end from those of one device (the largest difference, and the
 distance as a share of the way that training moved them), for "pmap", "mesh" (data alone), "fsdp" (2 × 2), and "muon": a
 smaller network by Muon under fsdp. "gradient pmap" …: how far the gradient of the first step is from one device's, as a
-share; some clips have no depth. "gradient heads": the same under fsdp of a model with a depth head, a motion head and
-adaptive norms. "mean of ratios" and "depth mean of ratios": how far the loss and its depth term are, as a share, if
-every device divides by its own weight. For the tokenizer: how far gradients and averages are from one device's
-("tokenizer pmap", "tokenizer fsdp"), and how far its entropy is if each device knows its own images alone ("tokenizer
-apart"). "checkpoint": how far two steps of one sharding, saved, and a third one of another are from three steps;
-"start": whether fresh parameters are the same to the bit if they are made in parts; "cut": the share of the fsdp state
-that one device holds.
+share; some clips have no depth. "gradient heads": the same under fsdp of a model with depth, motion and state heads and
+adaptive norms; the state heads lack labels for some clips. "mean of ratios" and "depth mean of ratios": how far the
+loss and its depth term are, as a share, if every device divides by its own weight. For the tokenizer: how far gradients
+and averages are from one device's ("tokenizer pmap", "tokenizer fsdp"), and how far its entropy is if each device knows
+its own images alone ("tokenizer apart"). "checkpoint": how far two steps of one sharding, saved, and a third one of
+another are from three steps; "start": whether fresh parameters are the same to the bit if they are made in parts;
+"cut": the share of the fsdp state that one device holds.
 """
 
 import json
@@ -68,9 +68,8 @@ CONFIG = Config(
     train=LOOP,
 )
 MODEL = RoboScape.create(CONFIG)
-HEADS = RoboScape.create(
-    with_values(CONFIG, {"model.depth": "head", "model.loss.keypoints": "motion", "model.action_encoder": "norms"})
-)
+WITH_HEADS = {"model.depth": "head", "model.loss.keypoints": "motion", "model.state_heads": "on"}
+HEADS = RoboScape.create(with_values(CONFIG, WITH_HEADS | {"model.action_encoder": "norms"}))
 TOKENIZER = TokenizerTraining.create(CONFIG)
 MUON = replace(LOOP, optimizer=Muon(learning_rate=1e-2, warmup_steps=1))
 SHARDINGS: dict[str, dict[str, Any]] = {
@@ -121,6 +120,7 @@ def batch(seed: int) -> Batch:
         "weight": np.array([1, 1, 1, 0, 0, 0, 1, 1], np.float32),
         "index": np.arange(8, dtype=np.int32),
         "has_depth": np.array([1, 0, 0, 1, 1, 0, 1, 1], np.float32),
+        "state": np.where(rng.random((8, 1, 3)) < 0.3, np.nan, rng.integers(0, 2, (8, 4, 3))).astype(np.float32),
     }
     return Batch(**fields)
 

@@ -34,6 +34,8 @@ class Architecture(TransformerConfig):
         depth_cells: token cells along each side of one of the depth branch's cells.
         motion_head: whether training predicts how tracked points move
             (:mod:`rsjax.models.roboscape.departures.motion_head`).
+        state_heads: whether success, height and opening are read from the features
+            (:mod:`rsjax.models.roboscape.departures.state_heads`).
         feature_dtype: of the features between layers; :func:`rsjax.models.roboscape.transformer.run_transformer` sets
             it, and :func:`rsjax.models.roboscape.sample.written_out`.
     """
@@ -49,6 +51,7 @@ class Architecture(TransformerConfig):
     depth_blocks: int = 0
     depth_cells: int = 1
     motion_head: bool = False
+    state_heads: bool = False
     feature_dtype: Literal["float32", "bfloat16"] = "float32"
 
     def __post_init__(self) -> None:
@@ -91,6 +94,7 @@ class Architecture(TransformerConfig):
             depth_blocks=small.blocks,
             depth_cells=small.cells,
             motion_head=model.keypoint_term == "motion",
+            state_heads=model.state_heads is not None,
         )
 
     @property

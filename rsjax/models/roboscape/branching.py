@@ -84,7 +84,8 @@ class TokenBranching:
         state = replace(self._start(self._sample(Decoding(steps=1)), cells), cache={})
         sums = np.zeros(len(self._codec.normalization.action_mean))
         tokens = {branch: grid.reshape(-1) for branch, grid in grids.items()}
-        return BranchState(self._codec.decode_rgb(grids["rgb"])[0, 0], tokens, None, _Memory(state, None, sums))
+        memory = _Memory(state, None, sums)
+        return BranchState(self._codec.decode_rgb(grids["rgb"])[0, 0], tokens, None, memory, state=_readings(state))
 
     def advance(
         self, states: Sequence[BranchState], actions: Float[np.ndarray, "N A"], decodings: Sequence[Decoding]
@@ -173,8 +174,16 @@ class TokenBranching:
         means = {branch: np.asarray(cells[0, -1]) for branch, cells in state.means.items() if branch in branches}
         assert state.entropy is not None
         size = sum(leaf.nbytes for leaf in jax.tree.leaves(memory.cache))
-        without = replace(memory, state=replace(state, entropy=None))
-        return BranchState(rgb, tokens, np.asarray(state.entropy[0]), without, size, means)
+        without = replace(memory, state=replace(state, entropy=None, features=None))
+        features = np.asarray(state.features)[0]
+        return BranchState(rgb, tokens, np.asarray(state.entropy[0]), without, size, means, features, _readings(state))
+
+
+def _readings(state: State) -> Float[np.ndarray, " K"] | None:
+    """Returns what the state heads read from the last frame of one clip; None without heads."""
+    if state.readings is None:
+        return None
+    return np.asarray(state.readings)[0]
 
 
 def program_clips(lanes: int) -> int:
@@ -219,6 +228,7 @@ def _advance(
         temperature=temperature[:, None],
         guidance=guidance[:, None],
         entropy=jnp.zeros((len(states), 1, arch.grid**2)),
+        features=jnp.zeros((len(states), 1, arch.width)),
     )
     stacked, frame = with_few_launches(arch, lambda arch: step(arch, sample, params, stacked, actions[:, None]))
     grid = frame["rgb"].reshape(len(states), arch.grid, arch.grid, *frame["rgb"].shape[3:])

@@ -7,6 +7,7 @@ Axes: T frames, S cells of a frame, C width, n vocabularies of V codes.
 """
 
 from rsjax.models.roboscape.architecture import Architecture
+from rsjax.models.roboscape.departures import state_heads
 from rsjax.models.roboscape.departures.adaptive_norms import changes
 from rsjax.models.roboscape.departures.motion_head import OUTPUTS
 
@@ -29,6 +30,8 @@ def forward_flops(config: Architecture, frames: int) -> int:
         products += tables * config.grid**2 * depth.width**2  # of the embeddings of a coarse cell's tokens
     for modality in config.modalities:  # the heads
         products += config.grid**2 * config.sizes(modality).width * config.vocabularies * config.vocabulary_size
+    if config.state_heads:
+        products += config.grid**2 * config.width * state_heads.PRODUCTS
     return 2 * frames * products
 
 

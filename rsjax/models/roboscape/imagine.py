@@ -3,8 +3,9 @@
 Axes: B clips, N of them, S cells, A action dimensions.
 """
 
+from dataclasses import replace
 from functools import partial
-from typing import cast
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -57,7 +58,8 @@ class TokenImagination:
         else:
             self._state = _restarted(jnp.asarray(which), fresh, self._state)
         self._sums[which] = 0
-        return self._codec.decode(grids, np.full(len(first), self._has_depth))
+        video = self._codec.decode(grids, np.full(len(first), self._has_depth))
+        return replace(video, state=_readings(fresh, which))
 
     def step(self, actions: Float[np.ndarray, "B A"]) -> Video:
         assert self._state is not None, "restart the clips first"
@@ -74,7 +76,15 @@ class TokenImagination:
             self._state,
             rows,
         )
-        return Video(np.asarray(rgb)[:, None], None if depth is None else np.asarray(depth)[:, None])
+        frames = None if depth is None else np.asarray(depth)[:, None]
+        return Video(np.asarray(rgb)[:, None], frames, state=_readings(self._state))
+
+
+def _readings(states: State, which: Any = slice(None)) -> Float[np.ndarray, "N 1 3"] | None:
+    """Returns what the state heads read from the last frames of a stack of clips; None without heads."""
+    if states.readings is None:
+        return None
+    return np.asarray(states.readings)[which]
 
 
 @partial(jax.jit, static_argnums=(0, 1))

@@ -3,7 +3,7 @@
 Axes: B clips, T frames, A action dimensions.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,19 +11,22 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from rsjax.clip import Video
 from rsjax.config import ClipShape, Config, RoboScapeConfig, TokenizerConfig, TokenModelConfig
+from rsjax.data.clips import readable, spread
 from rsjax.data.codec import Record
 from rsjax.data.loader import Arrays, Transform
 from rsjax.data.normalization import Normalization
+from rsjax.data.state_labels import knows_success, missing_labels
 from rsjax.data.store import Store
 from rsjax.devices import divide
 from rsjax.models.base import Assets, TeacherForced, WorldModel, implements
 from rsjax.models.roboscape import masking, objective, pretrained, records
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.branching import TokenBranching
+from rsjax.models.roboscape.departures import state_heads
 from rsjax.models.roboscape.departures.action_dropout import dropped_actions
 from rsjax.models.roboscape.departures.motion_head import MotionHead
 from rsjax.models.roboscape.departures.self_conditioning import conditions_itself, previous_frames
@@ -31,12 +34,15 @@ from rsjax.models.roboscape.departures.whole_frames import hidden
 from rsjax.models.roboscape.flops import forward_flops, motion_head_flops
 from rsjax.models.roboscape.imagine import TokenImagination
 from rsjax.models.roboscape.objective import Batch
-from rsjax.models.roboscape.sample import Tokens, encode_prompt, rollout, rollout_from
+from rsjax.models.roboscape.sample import Decoded, Tokens, encode_prompt, rollout, rollout_from
 from rsjax.models.roboscape.teacher_forcing import score_tokens
 from rsjax.models.roboscape.transformer import Transformer, empty_cache, run_transformer, run_with_trunk
+from rsjax.progress import note
 from rsjax.tokenizers.codec import Codec
 from rsjax.tokenizers.tokenize import tokenize_store
 from rsjax.trainable import Params, StepContext, Term
+
+LABELLED_CLIPS = 100  # training clips whose labels are checked before training
 
 
 @implements(RoboScapeConfig)
@@ -102,14 +108,32 @@ class RoboScape(WorldModel[Batch]):
             previous = previous_frames(first_pass, read, arch.code_bits, on, self.prompt_frames)
         trunk = None
         motion: Any = None
-        if self.config.keypoint_term in ("motion", "feature"):
-            logits, trunk = run_with_trunk(arch, params, *inputs, previous=previous, **options)
+        if arch.state_heads or self.config.keypoint_term in ("motion", "feature"):
+            logits, _, trunk = run_with_trunk(arch, params, *inputs, previous=previous, **options)
         else:
             logits, _ = run_transformer(arch, params, *inputs, previous=previous, **options)
         if arch.motion_head:
             motion = MotionHead().apply({"params": params["motion_head"]}, trunk)
         terms = objective.loss_terms(self.config, arch, logits, targets, mask, batch, trunk, motion)
+        if arch.state_heads:
+            assert trunk is not None and batch.state is not None
+            state_terms = state_heads.loss_terms(state_heads.outputs(params, trunk), batch.state, batch.weight)
+            terms |= {name: state_terms[name] for name in self.config.state_weights}
         return jax.tree.map(lambda x: x.astype("float32"), terms)
+
+    def check_clips(self, clips: Store) -> None:
+        """Notes which labels of the state heads training clips lack; their losses leave those clips out."""
+        if not self.architecture.state_heads:
+            return
+        source = clips.source("train")
+        records = [record for _, record in readable(source, spread(source, LABELLED_CLIPS))]
+        if not knows_success(clips):
+            records = [record | {"success": None} for record in records]
+        for name, count in missing_labels(records).items():
+            note(
+                f"{clips.path}: {count} of {len(records)} training clips have no label of {name}, as recordings and "
+                f"episodes of older versions; model.state_heads learns {name} from the others alone"
+            )
 
     def prepare(self, clips: Store, assets: Assets, folder: Path, max_damaged: float) -> Store:
         """Makes every clip's tokens and stores them next to the clips, for all runs with this tokenizer and shifts."""
@@ -118,7 +142,8 @@ class RoboScape(WorldModel[Batch]):
         return tokenize_store(clips, codec, self.clips.image_size, folder, max_damaged, shifts)
 
     def transform(self, normalization: Normalization) -> Transform:
-        return partial(records.token_arrays, normalization, self.config.departures.integrate_actions)
+        integrate = self.config.departures.integrate_actions
+        return partial(records.token_arrays, normalization, integrate, state=self.architecture.state_heads)
 
     def batch(self, arrays: Arrays) -> Batch:
         return records.token_batch(arrays)
@@ -144,7 +169,7 @@ class RoboScape(WorldModel[Batch]):
         tokens, inputs = divide((tokens, self._action_inputs(assets, actions)), params)
         key = jax.random.key(sample.seed)
         made = rollout(arch, sample, params, tokens, inputs, key, index=index, no_depth=~has_depth)
-        return self._codec(assets).decode(made, has_depth & depth)
+        return self._video(assets, made, has_depth & depth)
 
     def plan(
         self,
@@ -174,7 +199,7 @@ class RoboScape(WorldModel[Batch]):
         made = rollout_from(arch, sample, params, encoded, inputs[:, past:], key, same_draws)
         if last is not None:
             made = {branch: grid[:, -last:] for branch, grid in made.items()}
-        return self._codec(assets).decode(made, np.repeat(has_depth & depth, candidates))
+        return self._video(assets, made, np.repeat(has_depth & depth, candidates))
 
     def imagine(self, params: Params, assets: Assets, clips: int) -> TokenImagination:
         return TokenImagination(self.config, self.architecture, self._codec(assets), params, clips)
@@ -214,6 +239,13 @@ class RoboScape(WorldModel[Batch]):
     def _codec(self, assets: Assets) -> Codec:
         assert assets.tokenizer is not None
         return Codec(self.tokenizer, assets.tokenizer, assets.normalization)
+
+    def _video(self, assets: Assets, made: Decoded, has_depth: Bool[np.ndarray, " B"]) -> Video:
+        """Returns the video that a rollout makes, with what the state heads read."""
+        video = self._codec(assets).decode(made, has_depth)
+        if "state" not in made:
+            return video
+        return replace(video, state=np.asarray(made["state"]))
 
     def _tokens(self, assets: Assets, video: Video, arch: Architecture) -> tuple[Tokens, np.ndarray]:
         """Returns a video's tokens by branch (depth if network and a clip have it), and which clips have depth."""

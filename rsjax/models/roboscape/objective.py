@@ -41,6 +41,7 @@ class Batch:
         index: the clip's place in the global batch, which decides its random masks whichever device it is on.
         has_depth: 1 for a clip with depth, 0 for one without, whose depth tokens are zeros and never read; None: all
             clips have depth.
+        state: the labels of the state heads (:func:`rsjax.data.state_labels.state_labels`); None: the model has none.
     """
 
     rgb: Int32[clip.Array, "B T H W"]
@@ -51,6 +52,7 @@ class Batch:
     weight: Float[clip.Array, " B"]
     index: Int32[clip.Array, " B"]
     has_depth: Float[clip.Array, " B"] | None = None
+    state: Float[clip.Array, "B T 3"] | None = None
 
 
 @struct.dataclass

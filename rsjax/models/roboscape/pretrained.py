@@ -26,8 +26,9 @@ ALIKE = {"read_previous", "whole_frames", "rotary", "more_norms"}
 JOINING: tuple[str, ...] = ("blocks/depth_to_rgb/", "action_encoder/", "action_encoder_fc2/", "null_action")
 ADAPTIVE = "/action_norms/"
 HEAD_JOINING = ("depth_embed/", "depth_previous_embed/")
+OPTIONAL = {"motion_head", "state_heads"}  # parameters that are left out where this model lacks them
 # Fields that may differ.
-FREE = {"action_encoder", "action_inputs", "motion_head", "departures"} | {
+FREE = {"action_encoder", "action_inputs", "motion_head", "state_heads", "departures"} | {
     "compute_dtype",
     "feature_dtype",
     *(field.name for field in fields(TransformerConfig) if field.metadata.get("runtime")),
@@ -85,15 +86,15 @@ def start(fresh: Params, saved: Params, directory: Path) -> Params:
 
     What joins the RGB branch begins at zero: the depth → RGB projection or, with a depth head, the embeddings of depth,
     and the action encoder's last layer, or what adaptive norms read from it. So RGB logits are at first those of the
-    saved model. A saved action encoder is kept; it reads actions normalised for the new data. A saved motion head that
-    this model lacks is left out.
+    saved model. A saved action encoder is kept; it reads actions normalised for the new data. Saved motion or state
+    heads that this model lacks are left out.
 
     Raises:
         UserError: this model lacks a saved array, or has it in another shape.
     """
     own = flatten_dict(fresh, sep="/")
-    if "motion_head" not in fresh:
-        saved = {name: part for name, part in saved.items() if name != "motion_head"}
+    lacking = OPTIONAL - fresh.keys()
+    saved = {name: part for name, part in saved.items() if name not in lacking}
     params = _grouped(flatten_dict(saved, sep="/"), own)
     for path in params:
         if path not in own:

@@ -6,24 +6,28 @@ from rsjax.config import ClipShape
 from rsjax.data.codec import Record
 from rsjax.data.loader import Arrays
 from rsjax.data.normalization import Normalization
+from rsjax.data.state_labels import state_labels
 from rsjax.models.roboscape.departures.shifts import drawn_copy
 from rsjax.models.roboscape.objective import Batch
 
 ARRAYS = ("rgb", "depth", "actions", "tracks", "visible", "has_depth")
 
 
-def token_arrays(normalization: Normalization, integrate: bool, record: Record, rng: np.random.Generator) -> Arrays:
+def token_arrays(
+    normalization: Normalization, integrate: bool, record: Record, rng: np.random.Generator, state: bool = False
+) -> Arrays:
     """Returns the arrays of a token record that a training step reads.
 
     Args:
         normalization: that of the run's own store, even for records of other stores.
         integrate: whether to append the actions' sums (see ``Normalization.action_inputs``).
         rng: chooses among the clip and its moved copies, if it has any.
+        state: whether to add the labels of the state heads.
     """
     record = drawn_copy(record, rng)
     has_depth = record["depth"] is not None
     depth = record["depth"] if has_depth else np.zeros_like(record["rgb"])
-    return {
+    arrays = {
         "rgb": record["rgb"],
         "depth": depth,
         "actions": normalization.action_inputs(record["actions"], integrate),
@@ -31,6 +35,9 @@ def token_arrays(normalization: Normalization, integrate: bool, record: Record, 
         "visible": record["visible"],
         "has_depth": np.array(has_depth, np.float32),
     }
+    if state:
+        arrays["state"] = state_labels(record)
+    return arrays
 
 
 def token_batch(arrays: Arrays) -> Batch:
@@ -41,7 +48,8 @@ def token_batch(arrays: Arrays) -> Batch:
     size = len(arrays["rgb"])
     weight = arrays.get("weight", np.ones(size, np.float32))
     index = arrays.get("index", np.arange(size, dtype=np.int32))
-    return Batch(**{name: arrays[name] for name in ARRAYS}, weight=weight, index=index)
+    state = arrays.get("state")
+    return Batch(**{name: arrays[name] for name in ARRAYS}, weight=weight, index=index, state=state)
 
 
 def random_record(rng: np.random.Generator, clips: ClipShape, grid: int, code_bits: int) -> Record:

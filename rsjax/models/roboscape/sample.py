@@ -14,7 +14,7 @@ frame that the action encoder reads, n vocabularies of V codes, L blocks.
 """
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 from typing import Any
 
@@ -30,15 +30,23 @@ from rsjax.layers.dense import rounded
 from rsjax.layers.platform import where_launches_take_long
 from rsjax.layers.unstacked_params import apart, together
 from rsjax.models.roboscape.architecture import Architecture
-from rsjax.models.roboscape.departures import guidance, mean_codes
+from rsjax.models.roboscape.departures import guidance, mean_codes, state_heads
 from rsjax.models.roboscape.maskgit import Frame, unmask_step
-from rsjax.models.roboscape.transformer import Cache, Cells, StackedCache, empty_cache, run_transformer
+from rsjax.models.roboscape.transformer import (
+    Cache,
+    Cells,
+    StackedCache,
+    empty_cache,
+    run_transformer,
+    run_with_trunk,
+)
 from rsjax.trainable import Params
 
 ADDED_IN_BF16 = ("proj", "depth_to_rgb")  # layers that add their bias to features; the MLP's kernel adds it in float32
 
 Tokens = dict[str, Int[Array, "B T H W"]]
-Decoded = dict[str, Int[Array, "B T H W"] | Float[Array, "B T H W D"]]  # tokens, or codes if ``sample.shows_means``
+# By branch, tokens, or codes if ``sample.shows_means``; and "state", what the state heads read, if the model has them.
+Decoded = dict[str, Int[Array, "B T H W"] | Float[Array, "B T H W D"] | Float[Array, "B T K"]]
 
 
 @struct.dataclass
@@ -60,6 +68,9 @@ class State:
         temperature: of each clip, above 0, instead of that of ``sample``, which still decides whether tokens are drawn.
         guidance: of each clip instead of that of ``sample``, which still decides whether there is guidance.
         entropy: of the last frame's RGB tokens in nats; None: not requested.
+        readings: what the state heads read from the last frame; None: the model has none.
+        features: the RGB branch's features of the last frame in its first pass, which sees none of its cells, as means
+            over the cells; None: not requested.
     """
 
     tokens: dict[str, Int[Array, "B K S"]]
@@ -74,10 +85,13 @@ class State:
     temperature: Float[Array, " B"] | None = None
     guidance: Float[Array, " B"] | None = None
     entropy: Float[Array, "B S"] | None = None
+    readings: Float[Array, "B K"] | None = None
+    features: Float[Array, "B C"] | None = None
 
 
 # Axes of a stack of states; the blocks stay the cache's first axis.
-CLIPS: Any = State(0, 0, 0, 0, cache=1, position=0, frame=0, key=0, no_depth=0, temperature=0, guidance=0, entropy=0)  # type: ignore[arg-type]
+_AXES: dict[str, Any] = {field.name: int(field.name == "cache") for field in fields(State)}
+CLIPS: Any = State(**_AXES)
 
 
 @struct.dataclass
@@ -103,12 +117,14 @@ def start(
     clips, past = tokens["rgb"].shape[:2]
     base = int(window_start(arch, sample, past))
     cache: Any = new_cache(arch, sample, clips, cache_slots(arch, past))
-    known = slice(base, past - arch.uncommitted)
+    known = slice(base, past - unread(arch))
+    readings = None
     if known.stop > base:
         seen = {branch: cells[:, known] for branch, cells in tokens.items()}
         mask = jnp.zeros(seen["rgb"].shape, bool)
         rows = window_actions(arch, actions[:, known], actions[:, base], 0)
-        _, cache = apply_network(arch, sample, params, seen, mask, rows, 0, cache, no_depth)
+        _, cache, trunk = apply_network(arch, sample, params, seen, mask, rows, 0, cache, no_depth)
+        readings = read_state(arch, params, trunk)
 
     kept = remembered_frames(arch, sample)
 
@@ -126,6 +142,7 @@ def start(
         frame=jnp.asarray(past, jnp.int32),
         key=key,
         no_depth=no_depth,
+        readings=readings,
     )
 
 
@@ -179,14 +196,26 @@ def _decode_frame(
     mask = jnp.broadcast_to(jnp.array([False, True])[None, :, None], (clips, 2, cells))
     rows = jnp.stack([state.actions[:, -1], actions], axis=1)
     rows = window_actions(arch, rows, state.base, state.position - 1)
-    network = partial(apply_network, arch, sample, params, no_depth=state.no_depth, strength=state.guidance)
+    network = partial(
+        apply_network,
+        arch,
+        sample,
+        params,
+        no_depth=state.no_depth,
+        strength=state.guidance,
+        keep_trunk=state.features is not None,
+    )
     unmask = partial(unmask_step, sample, arch.code_bits, no_depth=state.no_depth, temperature=state.temperature)
     keys = jax.vmap(lambda key: jax.random.split(jax.random.fold_in(key, state.frame), sample.steps))(state.key)
 
     first = 1 - arch.uncommitted  # frame of the first pass
     seen, seen_rows, seen_previous = jax.tree.map(lambda x: x[:, first:], (pair, rows, previous))
     begin = state.position - 1 + first
-    logits, cache = network(seen, mask[:, first:], seen_rows, begin, state.cache, previous=seen_previous)
+    logits, cache, trunk = network(seen, mask[:, first:], seen_rows, begin, state.cache, previous=seen_previous)
+    features = None
+    if state.features is not None:
+        assert trunk is not None
+        features = jnp.mean(trunk[:, -1], axis=1)
     undecided = {branch: jnp.zeros((clips, cells), jnp.int32) for branch in read}
     entropy = None if state.entropy is None else jnp.zeros((clips, cells))
     frame = Frame(undecided, mask[:, 1], entropy, mean_codes.codes_of(sample, undecided, arch.code_bits))
@@ -195,12 +224,14 @@ def _decode_frame(
     # features of both passes by one kernel of depth_to_rgb, which takes a copy and two sums more than two products.
     frame = jax.lax.optimization_barrier(frame)
 
-    def later_pass(number: Array, frame: Frame) -> Frame:
+    def later_pass(number: Array, carry: tuple[Frame, Any]) -> tuple[Frame, Any]:
+        frame, _ = carry
         seen = {branch: x[:, None] for branch, x in mean_codes.read(sample, frame.tokens, frame.means).items()}
-        logits, _ = network(seen, frame.mask[:, None], rows[:, 1:], state.position, cache, previous=last)
-        return unmask(keys[:, number], number, frame, {branch: x[:, 0] for branch, x in logits.items()})
+        logits, _, trunk = network(seen, frame.mask[:, None], rows[:, 1:], state.position, cache, previous=last)
+        frame = unmask(keys[:, number], number, frame, {branch: x[:, 0] for branch, x in logits.items()})
+        return frame, read_state(arch, params, trunk)
 
-    frame = jax.lax.fori_loop(1, sample.steps, later_pass, frame)
+    frame, readings = jax.lax.fori_loop(1, sample.steps, later_pass, (frame, read_state(arch, params, trunk)))
 
     def appended(kept: Array, new: Array) -> Array:
         return jnp.concatenate([kept[:, 1:], new[:, None]], axis=1)
@@ -214,7 +245,17 @@ def _decode_frame(
         position=state.position + 1,
         frame=state.frame + 1,
         entropy=frame.entropy,
+        readings=readings,
+        features=features,
     )
+
+
+def read_state(arch: Architecture, params: Params, trunk: Float[Array, "B T S C"] | None) -> Float[Array, "B K"] | None:
+    """Returns what the state heads read from the last of these frames; None for a model without them."""
+    if not arch.state_heads:
+        return None
+    assert trunk is not None
+    return state_heads.readings(params, trunk[:, -1:])[:, 0]
 
 
 def _renew_window(
@@ -230,7 +271,7 @@ def _renew_window(
         seen = {branch: x[:, newest][:, :encoded] for branch, x in read.items()}
         rows = window_actions(arch, state.actions[:, newest][:, :encoded], base, 0)
         mask = jnp.zeros(seen["rgb"].shape[:3], bool)
-        _, cache = apply_network(arch, sample, params, seen, mask, rows, 0, cache, state.no_depth)
+        _, cache, _ = apply_network(arch, sample, params, seen, mask, rows, 0, cache, state.no_depth)
     moved = replace(state, base=base, cache=cache, position=jnp.full_like(state.position, kept))
     return where(full, moved, state)
 
@@ -253,22 +294,29 @@ def apply_network(
     no_depth: Bool[Array, " B"] | None = None,
     previous: dict[str, Cells] | None = None,
     strength: Float[Array, " B"] | None = None,
-) -> tuple[dict[str, Float[Array, "B T S n V"]], Any]:
-    """Returns the logits of a pass and the cache; arguments as for :class:`Transformer`, ``strength`` for guidance.
+    keep_trunk: bool = False,
+) -> tuple[dict[str, Float[Array, "B T S n V"]], Any, Float[Array, "B T S C"] | None]:
+    """Returns the logits of a pass, the cache and the trunk; arguments as for :class:`Transformer`.
 
     Args:
         params: with stacked blocks, or split by :mod:`rsjax.layers.unstacked_params`.
         cache: from :func:`new_cache` or an earlier call; None: the frames see each other alone.
+        strength: of guidance.
+        keep_trunk: whether to return the features that RGB's head reads, also if the model has no state heads.
     """
     inputs = (tokens, mask, actions, no_depth, previous)
     (tokens, mask, actions, no_depth, previous), drop = guidance.doubled(sample, inputs, len(mask))
     shape = (*mask.shape[:2], arch.grid, arch.grid)
     grids = {branch: cells.reshape(*shape, *cells.shape[3:]) for branch, cells in tokens.items()}
     whole = params | {"blocks": together(params["blocks"])}
-    logits, cache = run_transformer(
-        arch, whole, grids, mask.reshape(shape), actions, start, cache, drop, no_depth, previous
-    )
-    return guidance.guided(sample, logits, strength), cache
+    arguments = (grids, mask.reshape(shape), actions, start, cache, drop, no_depth, previous)
+    trunk = None
+    if arch.state_heads or keep_trunk:
+        logits, cache, trunk = run_with_trunk(arch, whole, *arguments)
+        trunk = trunk[: len(trunk) // guidance.copies(sample)]  # of the clips with their actions
+    else:
+        logits, cache = run_transformer(arch, whole, *arguments)
+    return guidance.guided(sample, logits, strength), cache, trunk
 
 
 def new_cache(arch: Architecture, sample: SampleConfig, clips: int, slots: int) -> StackedCache:
@@ -309,7 +357,14 @@ def cache_slots(arch: Architecture, past: int) -> int:
     """
     if not arch.departures.rotary:
         return arch.frames
-    return max(arch.frames + 1, past - arch.uncommitted)
+    return max(arch.frames + 1, past - unread(arch))
+
+
+def unread(arch: Architecture) -> int:
+    """Returns how many of a prompt's frames :func:`start` leaves to the next pass: none that state heads read."""
+    if arch.state_heads:
+        return 0
+    return arch.uncommitted
 
 
 def window_actions(
@@ -539,6 +594,7 @@ def _continue(
         cache=jax.tree.map(repeated_cache, state.cache),
         key=keys,
         no_depth=None if state.no_depth is None else repeated(state.no_depth),
+        readings=None if state.readings is None else repeated(state.readings),
     )
     return with_few_launches(arch, partial(_repeat_step, sample, params, tokens, state, actions, frames))
 
@@ -559,11 +615,14 @@ def _repeat_step(
     state = replace(state, cache=apart(state.cache, arch.groups, arch.unroll))
     known = mean_codes.codes_of(sample, prompt, arch.code_bits) or prompt
     made = {branch: _with_room(cells, actions.shape[1]) for branch, cells in known.items()}
+    made |= _prompt_readings(state, past, actions.shape[1])
 
     def next_frame(number: Array, carry: tuple[State, dict[str, Array]]) -> tuple[State, dict[str, Array]]:
         state, made = carry
         row = jax.lax.dynamic_index_in_dim(actions, number - past, axis=1, keepdims=False)
         state, frame = step(arch, sample, params, state, row, beyond)
+        if state.readings is not None:
+            frame["state"] = state.readings
         return state, _put(made, frame, number)
 
     state, made = jax.lax.fori_loop(past, frames, next_frame, (state, made))
@@ -591,9 +650,13 @@ def _recomputed(
     params = for_many_passes(arch, params)
     tokens = {branch: _with_room(cells, total - past + length) for branch, cells in prompt.items()}
     means = mean_codes.codes_of(sample, tokens, arch.code_bits)
+    made: dict[str, Array] = {}
+    if arch.state_heads:
+        after_prompt = start(arch, sample, params, prompt, actions[:, :past], keys, no_depth)
+        made = _prompt_readings(after_prompt, past, total - past + length)
 
-    def next_frame(t: Array, carry: tuple[dict[str, Array], dict[str, Array]]) -> tuple[Any, Any]:
-        tokens, means = carry
+    def next_frame(t: Array, carry: tuple[dict[str, Array], ...]) -> tuple[dict[str, Array], ...]:
+        tokens, means, made = carry
         base = window_start(arch, sample, t)
         rows = jax.lax.dynamic_slice_in_dim(actions, base, length, axis=1)
         rows = window_actions(arch, rows, rows[:, 0], 0)
@@ -602,7 +665,8 @@ def _recomputed(
         masked = jnp.ones(undecided["rgb"].shape, bool)
         frame = Frame(undecided, masked, None, mean_codes.codes_of(sample, undecided, arch.code_bits))
 
-        def one_pass(number: Array, frame: Frame) -> Frame:
+        def one_pass(number: Array, carry: tuple[Frame, dict[str, Array]]) -> tuple[Frame, dict[str, Array]]:
+            frame, _ = carry
             read = mean_codes.read(sample, tokens, means)
             clip = _put(read, mean_codes.read(sample, frame.tokens, frame.means), t)
             window = {
@@ -610,15 +674,20 @@ def _recomputed(
             }
             is_t = jnp.arange(length)[None, :, None] == t - base
             mask = is_t & frame.mask[:, None]
-            logits, _ = apply_network(arch, sample, params, window, mask, rows, 0, None, no_depth)
+            logits, _, trunk = apply_network(arch, sample, params, window, mask, rows, 0, None, no_depth)
             at_t = {branch: x[:, t - base] for branch, x in logits.items()}
-            return unmask_step(sample, arch.code_bits, step_keys[:, number], number, frame, at_t, no_depth)
+            frame = unmask_step(sample, arch.code_bits, step_keys[:, number], number, frame, at_t, no_depth)
+            if not arch.state_heads:
+                return frame, {}
+            assert trunk is not None
+            return frame, {"state": state_heads.readings(params, trunk)[:, t - base]}
 
-        frame = jax.lax.fori_loop(0, sample.steps, one_pass, frame)
-        return _put(tokens, frame.tokens, t), _put(means, frame.means, t)
+        unknown = {name: x[:, 0] for name, x in made.items()}
+        frame, readings = jax.lax.fori_loop(0, sample.steps, one_pass, (frame, unknown))
+        return _put(tokens, frame.tokens, t), _put(means, frame.means, t), _put(made, readings, t)
 
-    tokens, means = jax.lax.fori_loop(past, frames, next_frame, (tokens, means))
-    return _grids(arch, means or tokens, no_depth)
+    tokens, means, made = jax.lax.fori_loop(past, frames, next_frame, (tokens, means, made))
+    return _grids(arch, (means or tokens) | made, no_depth)
 
 
 def with_few_launches(arch: Architecture, run: Callable[[Architecture], Any]) -> Any:
@@ -645,6 +714,14 @@ def for_many_passes(arch: Architecture, params: Params) -> Params:
     return params | {"blocks": apart(blocks, arch.groups, arch.unroll)}
 
 
+def _prompt_readings(state: State, past: int, frames: int) -> dict[str, Float[Array, "B T K"]]:
+    """Returns the readings of a rollout before its first step: NaN before the prompt's last frame."""
+    if state.readings is None:
+        return {}
+    last = state.readings[:, None]
+    return {"state": jnp.pad(last, ((0, 0), (past - 1, frames), (0, 0)), constant_values=jnp.nan)}
+
+
 def _with_room(cells: Array, frames: int) -> Array:
     """Returns cells followed by zeros for this many frames."""
     return jnp.pad(cells, [(0, 0), (0, frames), *[(0, 0)] * (cells.ndim - 2)])
@@ -659,8 +736,11 @@ def _put(clips: dict[str, Array], frame: dict[str, Array], t: Array) -> dict[str
 
 
 def _grids(arch: Architecture, cells: dict[str, Array], no_depth: Bool[Array, " B"] | None) -> Decoded:
-    """Returns the grids that pictures are decoded from, with zeros as depth of clips that have none."""
-    grids = {branch: x.reshape(*x.shape[:2], arch.grid, arch.grid, *x.shape[3:]) for branch, x in cells.items()}
+    """Returns the grids that pictures are decoded from, with zeros as depth of clips that have none, and readings."""
+    grids = dict(cells)
+    for branch in arch.modalities:
+        x = cells[branch]
+        grids[branch] = x.reshape(*x.shape[:2], arch.grid, arch.grid, *x.shape[3:])
     if no_depth is not None:
         hidden = no_depth.reshape(-1, *[1] * (grids["depth"].ndim - 1))
         grids["depth"] = jnp.where(hidden, 0, grids["depth"])

@@ -21,8 +21,8 @@ from rsjax.models.base import TeacherForced
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.departures.read_previous import frame_before
 from rsjax.models.roboscape.maskgit import sample_tokens
-from rsjax.models.roboscape.sample import cache_slots, window_actions, window_start
-from rsjax.models.roboscape.transformer import empty_cache, run_transformer
+from rsjax.models.roboscape.sample import cache_slots, read_state, window_actions, window_start
+from rsjax.models.roboscape.transformer import empty_cache, run_transformer, run_with_trunk
 from rsjax.tokenizers import lfq
 from rsjax.trainable import Params
 
@@ -59,11 +59,11 @@ def score_tokens(
         scores = _score_window(replace(arch, unroll=1), params, window, rows, no_depth)
         scored = [t - base for t in range(past, frames) if starts[t] == base]
         parts.append(jax.tree.map(lambda x, scored=scored: np.asarray(x)[:, scored], scores))
-    joined = jax.tree.map(lambda *x: np.concatenate(x, axis=1), *parts)
-    if "depth" in joined[0]:
-        for scores in joined:
+    nats, right, features, state = jax.tree.map(lambda *x: np.concatenate(x, axis=1), *parts)
+    if "depth" in nats:
+        for scores in (nats, right):
             scores["depth"][no_depth] = np.nan
-    return TeacherForced(*joined)
+    return TeacherForced(nats, right, features, state)
 
 
 def _window(x: Array, start: int, size: int) -> Array:
@@ -75,27 +75,30 @@ def _window(x: Array, start: int, size: int) -> Array:
 @partial(jax.jit, static_argnums=0)
 def _score_window(
     arch: Architecture, params: Params, tokens: Tokens, actions: Float[Array, "B T A"], no_depth: Bool[Array, " B"]
-) -> tuple[Scores, Scores]:
-    """Returns cross-entropy and accuracy of each frame's tokens by branch; frame 0 is predicted from none."""
+) -> tuple[Scores, Scores, Float[Array, "B T C"], Float[Array, "B T K"] | None]:
+    """Returns cross-entropy and accuracy of each frame's tokens by branch, features and what the state heads read.
+
+    Frame 0 is predicted from none.
+    """
     clips, frames = actions.shape[:2]
-    transformer = partial(run_transformer, arch, params, no_depth=no_depth)
     visible = jnp.zeros((clips, frames, arch.grid, arch.grid), bool)
     empty = empty_cache(arch, clips, cache_slots(arch, frames + arch.uncommitted))
-    _, cache = transformer(tokens, visible, actions, 0, empty)
+    _, cache = run_transformer(arch, params, tokens, visible, actions, 0, empty, no_depth=no_depth)
     before = {name: frame_before(grid.reshape(clips, frames, -1)) for name, grid in tokens.items()}
 
-    def score(t: Array) -> tuple[Scores, Scores]:
+    def score(t: Array) -> tuple[Scores, Scores, Float[Array, "B C"], Float[Array, "B K"] | None]:
         frame = {name: jax.lax.dynamic_slice_in_dim(grid, t, 1, axis=1) for name, grid in tokens.items()}
         action = jax.lax.dynamic_slice_in_dim(actions, t, 1, axis=1)
         previous = {name: jax.lax.dynamic_slice_in_dim(cells, t, 1, axis=1) for name, cells in before.items()}
-        logits, _ = transformer(frame, ~visible[:, :1], action, t, cache, previous=previous)
+        inputs = (frame, ~visible[:, :1], action, t, cache)
+        logits, _, trunk = run_with_trunk(arch, params, *inputs, no_depth=no_depth, previous=previous)
         likeliest = {
             name: sample_tokens(jax.random.key(0), x, 0.0, arch.code_bits)[0].reshape(frame[name].shape)
             for name, x in logits.items()
         }
         nats = {name: lfq.token_cross_entropy(x, frame[name], arch.code_bits) for name, x in logits.items()}
         right = {name: (grid == frame[name]).astype(jnp.float32) for name, grid in likeliest.items()}
-        means: tuple[Scores, Scores] = jax.tree.map(lambda x: x.mean((1, 2, 3)), (nats, right))
-        return means
+        nats, right = jax.tree.map(lambda x: x.mean((1, 2, 3)), (nats, right))
+        return nats, right, trunk[:, 0].mean(1), read_state(arch, params, trunk)
 
     return jax.vmap(score, out_axes=1)(jnp.arange(frames))

@@ -33,6 +33,7 @@ from rsjax.models.roboscape.departures.motion_head import MotionHead
 from rsjax.models.roboscape.departures.norms import optional_norm
 from rsjax.models.roboscape.departures.read_previous import absent_cells, frame_before
 from rsjax.models.roboscape.departures.rotary import rotated
+from rsjax.models.roboscape.departures.state_heads import StateHeads
 from rsjax.models.roboscape.departures.whole_frames import hidden
 from rsjax.tokenizers import lfq
 from rsjax.trainable import Params
@@ -380,9 +381,11 @@ class Transformer(nn.Module):
         tokens = jnp.zeros((1, 1, cfg.grid, cfg.grid), jnp.int32)
         actions = jnp.zeros((1, 1, cfg.action_inputs))
         params = self.init(key, dict.fromkeys(cfg.modalities, tokens), tokens == 0, actions)["params"]
+        features = jnp.zeros((1, 1, 1, cfg.width))
         if cfg.motion_head:
-            features = jnp.zeros((1, 1, 1, cfg.width))
             params["motion_head"] = MotionHead(parent=None).init(jax.random.fold_in(key, 1), features)["params"]
+        if cfg.state_heads:
+            params["state_heads"] = StateHeads(parent=None).init(jax.random.fold_in(key, 2), features)["params"]
         return params
 
 
@@ -397,13 +400,13 @@ def run_transformer(arch: Architecture, params: Params, *inputs: Any, **options:
 
 def run_with_trunk(
     arch: Architecture, params: Params, *inputs: Any, **options: Any
-) -> tuple[dict[str, Float[Array, "B T S n V"]], Float[Array, "B T S C"]]:
-    """Returns logits as :func:`run_transformer` does, and the float32 features that RGB's head reads."""
+) -> tuple[dict[str, Float[Array, "B T S n V"]], Cache | None, Float[Array, "B T S C"]]:
+    """Returns what :func:`run_transformer` does, and the float32 features that RGB's head reads."""
 
     def run(dtype: Any) -> Any:
         network = Transformer(replace(arch, feature_dtype=dtype))
-        (logits, _), kept = network.apply({"params": params}, *inputs, mutable=["trunk"], **options)
-        return logits, kept["trunk"]["rgb"][0]
+        (logits, cache), kept = network.apply({"params": params}, *inputs, mutable=["trunk"], **options)
+        return logits, cache, kept["trunk"]["rgb"][0]
 
     return in_feature_dtype(arch.compute_dtype, run)
 

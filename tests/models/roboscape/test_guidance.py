@@ -36,7 +36,7 @@ def test_guided_logits_lie_on_the_line_through_those_without_and_with_actions(gu
         here = slice(start, start + 2)
         piece = {name: grid[:, here] for name, grid in flat(tokens).items()}
         hidden = mask[:, here].reshape(BATCH, 2, 9)
-        logits, cache = guided(params, piece, hidden, actions[:, here], start, cache)
+        logits, cache, _ = guided(params, piece, hidden, actions[:, here], start, cache)
         for name, x in logits.items():
             expected = without[name] + guidance * (with_[name] - without[name])
             np.testing.assert_allclose(x, expected[:, here], rtol=1e-4, atol=1e-4)

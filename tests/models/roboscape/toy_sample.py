@@ -43,7 +43,7 @@ def count_model(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
     def apply(*inputs: Any, **_: Any) -> Any:
         tokens, mask, cache = inputs[3], inputs[4], inputs[7]
         seen.update(calls=1, frames=mask.shape[0] * mask.shape[1])
-        return {name: jnp.zeros((*mask.shape, 2, 8)) for name in tokens}, cache
+        return {name: jnp.zeros((*mask.shape, 2, 8)) for name in tokens}, cache, None
 
     monkeypatch.setattr(sample, "apply_network", apply)
     monkeypatch.setattr(sample, "unmask_step", lambda config, code_bits, keys, step, frame, *_, **__: frame)

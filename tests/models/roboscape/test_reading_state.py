@@ -1,0 +1,126 @@
+"""What the state heads read is the same however a video is generated, and stays with it."""
+
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rsjax.clip import Video
+from rsjax.config import SampleConfig, StateHeadsConfig
+from rsjax.data.store import Store, encode_clip, open_store, write_store
+from rsjax.models.base import create_model
+from rsjax.models.branch_states import Decoding
+from rsjax.models.roboscape.teacher_forcing import score_tokens
+from rsjax.models.trained import TrainedModel
+from tests.tools.pipeline import toy
+
+FRAMES = 9  # the window is 6
+
+
+@pytest.fixture(scope="module")
+def clips(tmp_path_factory: pytest.TempPathFactory) -> Store:
+    return toy.store(tmp_path_factory.mktemp("state") / "clips")
+
+
+@pytest.fixture(scope="module")
+def model(clips: Store) -> TrainedModel:
+    sample = SampleConfig(steps=2)
+    return toy.trained(clips, toy.with_model(toy.config(), sample=sample, state_heads=StateHeadsConfig()))
+
+
+@pytest.fixture(scope="module")
+def actions(model: TrainedModel) -> np.ndarray:
+    return np.random.default_rng(0).uniform(-1, 1, (FRAMES, model.config.clips.action_dim)).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def generated(model: TrainedModel, clips: Store, actions: np.ndarray) -> Any:
+    clip = clips.source("test")[1]
+    return model.generate(clip["rgb"][:1], actions, clip["depth"][:1])
+
+
+def test_a_video_has_the_state_of_every_frame(generated: Any) -> None:
+    assert generated.state is not None
+    assert generated.state.shape == (FRAMES, 3)
+    assert np.ptp(generated.state, axis=0).min() > 0
+    assert np.all((generated.state[:, 0] > 0) & (generated.state[:, 0] < 1))
+
+
+def test_plans_steps_and_branches_read_what_generate_reads(
+    model: TrainedModel, clips: Store, actions: np.ndarray, generated: Any
+) -> None:
+    clip = clips.source("test")[1]
+    planned: Any = model.plan(clip["rgb"][:1], actions[None].repeat(2, 0), clip["depth"][:1])
+    np.testing.assert_allclose(planned.state[1], generated.state, atol=1e-4)
+
+    first = Video(clip["rgb"][None, :1], clip["depth"][None, :1])
+    stepping = model.model.imagine(model.params, model.assets, 1)
+    read: list[Any] = [stepping.restart(np.array([True]), first, np.array([0])).state]
+    read += [stepping.step(row[None]).state for row in actions[1:]]
+    np.testing.assert_allclose(np.concatenate(read, axis=1)[0], generated.state, atol=1e-4)
+
+    lanes = model.model.branching(model.params, model.assets, True)
+    state = lanes.begin(first)
+    branched: list[Any] = [state.state]
+    for row in actions[1:]:
+        [state] = lanes.advance([state], row[None], [Decoding(steps=2)])
+        branched.append(state.state)
+    np.testing.assert_allclose(np.stack(branched), generated.state, atol=1e-4)
+
+
+def test_a_branch_has_the_features_that_teacher_forcing_on_its_frames_has(
+    model: TrainedModel, clips: Store, actions: np.ndarray
+) -> None:
+    family: Any = model.model
+    arch = family.architecture
+    clip = clips.source("test")[0]
+    lanes = model.model.branching(model.params, model.assets, True)
+    state = lanes.begin(Video(clip["rgb"][None, :1], clip["depth"][None, :1]))
+    states = [state]
+    for row in actions[1:]:
+        [state] = lanes.advance([state], row[None], [Decoding(steps=2)])
+        states.append(state)
+    grids = {name: np.stack([each.tokens[name] for each in states])[None] for name in ("rgb", "depth")}
+    tokens = {name: grid.reshape(1, FRAMES, arch.grid, arch.grid) for name, grid in grids.items()}
+    inputs = jnp.asarray(model.assets.normalization.action_inputs(actions[None], False))
+    scores: Any = score_tokens(arch, family.config.sample, model.params, tokens, inputs, np.zeros(1, bool), 1)
+    made: list[Any] = [each.features for each in states[1:]]
+    np.testing.assert_allclose(np.stack(made), scores.features[0], rtol=1e-3, atol=1e-4)
+    assert states[0].features is None
+
+
+def test_tokens_carry_success_only_where_the_data_set_knows_it(tmp_path: Path) -> None:
+    known = toy.store(tmp_path / "known")
+    records = [toy.clip(0), toy.clip(1)]
+    meta = {name: value for name, value in known.manifest.items() if name not in ("success_share", "splits")}
+    splits = {split: map(encode_clip, records) for split in ("train", "test")}
+    write_store(tmp_path / "unknown", "clips", splits, meta | {"key": "other"})
+    cfg = toy.with_model(toy.config(), state_heads=StateHeadsConfig())
+    model = create_model(cfg)
+    for store, says in ((known, True), (open_store(tmp_path / "unknown"), False)):
+        tokens = model.prepare(store, toy.assets(store), tmp_path, 0.0)
+        assert tokens is not None
+        arrays = model.transform(toy.assets(store).normalization)(tokens.source("train")[0], np.random.default_rng(0))
+        assert np.isnan(arrays["state"][:, 0]).all() != says
+        assert np.isnan(arrays["state"][:, 1:]).all()
+
+
+def test_labels_that_clips_lack_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    store = toy.store(tmp_path / "clips")
+    create_model(toy.config()).check_clips(store)
+    assert not capsys.readouterr().out
+    create_model(toy.with_model(toy.config(), state_heads=StateHeadsConfig())).check_clips(store)
+    told = capsys.readouterr().out
+    assert "3 of 3 training clips have no label of height" in told
+    assert "label of success" not in told
+
+
+def test_a_model_without_heads_reads_nothing(clips: Store) -> None:
+    plain = toy.trained(clips)
+    clip = clips.source("test")[0]
+    video = plain.generate(clip["rgb"][:1], np.zeros((3, plain.config.clips.action_dim), np.float32), clip["depth"][:1])
+    assert video.state is None
+    assert "state_heads" not in jax.eval_shape(plain.model.init, jax.random.key(0))
