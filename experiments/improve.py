@@ -21,7 +21,7 @@ class Options(Improvement, Trials):
     data_dir: Path = Path("data")
     """Directory of simulated data sets."""
     judge: Path | None = None
-    """Folder of the judge; default: the run's own (experiments.judge)."""
+    """Folder of the judge, or head: the model's own success head; default: the run's judge (experiments.judge)."""
     policy: Path | None = None
     """Directory of the policy to start with; default: train one on --demos real demonstrations."""
     demos: int = 50

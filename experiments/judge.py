@@ -21,6 +21,8 @@ class Options(JudgeSettings):
     """Directory of simulated data sets."""
     store: Path | None = None
     """The new path of the run's store of ingested clips, if it was moved."""
+    head: bool = False
+    """Train nothing, but validate the model's own success head as a judge (--model.state-heads on)."""
 
 
 @main_errors()
@@ -28,13 +30,20 @@ def main() -> None:
     """Writes RUN/judge and prints the results of the validation."""
     tune_process()
     options = parse_options(sys.argv[1:], "python -m experiments.judge", Options.__doc__ or "", Options())
-    from rsjax.tools.policies.judges.judge_training import make_judge
-    from rsjax.tools.policies.judges.validation import table
+    from rsjax.tools.policies.judges import head_judge, judge_training
+    from rsjax.tools.policies.judges.validation import table, whole_clips
     from rsjax.tools.studies.tables import as_markdown
 
-    result = make_judge(options.run, options.data_dir, options.store, part(options, JudgeSettings))
+    make = judge_training.make_judge
+    folder = judge_training.FOLDER
+    if options.head:
+        make = judge_training.validate_heads
+        folder = head_judge.FOLDER
+    result = make(options.run, options.data_dir, options.store, part(options, JudgeSettings))
     print(f"judge on {result['clips']} held-out clips: frames by label\n\n{as_markdown(table(result))}\n")
-    print(options.run / "judge")
+    if whole := whole_clips(result):
+        print(f"whole clips, by how many frames in a row must show success\n\n{as_markdown(whole)}\n")
+    print(options.run / folder)
 
 
 if __name__ == "__main__":

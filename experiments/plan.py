@@ -20,13 +20,15 @@ class Options:
     """A run directory, made by experiments.train on simulated clips."""
     methods: tuple[Literal["cem", "mppi"], ...] = ("cem", "mppi")
     """Ways to search."""
-    energy: Literal["judge", "tokens", "pixels", "lpips"] = "judge"
-    """What to minimise at the horizon: 1 - the judge's probability of success (experiments.judge), or the distance of
-    the last frame to a goal image, which is the expert's last frame."""
+    energy: Literal["judge", "success", "tokens", "pixels", "lpips"] = "judge"
+    """What to minimise at the horizon: 1 - the probability of success, by the judge (experiments.judge) or by the
+    model's own success head; or the distance of the last frame to a goal image, which is the expert's last frame."""
     lpips_weights: str = ""
     """Weights for the energy lpips (docs/evaluation.md)."""
     policy: Path | None = None
     """A policy of experiments.policy_learning to compare with as well."""
+    warm_start: bool = False
+    """Also plan with the policy's plans among the candidates."""
     episodes: int = 50
     """Episodes for each way to act, with equal starts."""
     max_steps: int = 20
@@ -58,7 +60,7 @@ def main() -> None:
 
     fields = ("horizon", "candidates", "rounds", "elites", "temperature", "seed")
     planner = PlannerConfig(**{name: getattr(options, name) for name in fields})
-    limits = (options.episodes, options.max_steps)
+    limits = (options.episodes, options.max_steps, options.warm_start)
     settings = PlanSettings(planner, options.methods, options.energy, options.lpips_weights, *limits)
     trained = load(options.run)
     policies: dict[str, Any] = {}

@@ -16,7 +16,7 @@ from rsjax.tools.play.session import Session
 from rsjax.tools.play.tree import Branch, Node
 from rsjax.tools.policies.judges.judge_training import FOLDER
 from rsjax.tools.policies.judges.trained_judge import FILE
-from rsjax.tools.policies.planning.closed_loop import PlanSettings, actors
+from rsjax.tools.policies.planning.closed_loop import EnergyName, PlanSettings, actors
 from rsjax.tools.policies.worlds.world import Actor
 
 KINDS = ("clip", "random", "policy", "planner")
@@ -82,7 +82,7 @@ class Sources:
         if kind == "policy":
             assert self.run.policy is not None
             return self.run.policy.actor(session.seed)
-        settings = PlanSettings(methods=("cem",))
+        settings = PlanSettings(methods=("cem",), energy=_energy(self.run))
         planner = actors(self.run.trained, self.run.data.run, settings)["cem"]
         return planner(session.seed, branch.nodes[0].state.rgb)
 
@@ -95,9 +95,16 @@ def reasons(run: PlayRun) -> dict[str, str]:
         why["policy"] = "no policy was named with --policy"
     if config.data is not None or config.sim.env != "lift":
         why["planner"] = "planning needs a run on the simulated Lift"
-    elif not (run.data.run / FOLDER / FILE).exists():
+    elif _energy(run) == "judge" and not (run.data.run / FOLDER / FILE).exists():
         why["planner"] = f"the run has no judge; python -m experiments.judge {run.data.run} trains one"
     return why
+
+
+def _energy(run: PlayRun) -> EnergyName:
+    """Returns what the planner minimises: by the model's own success head if it has one."""
+    if getattr(run.data.config.model, "state_heads", None) is None:
+        return "judge"
+    return "success"
 
 
 def _seen(session: Session, node: Node) -> dict[str, np.ndarray]:

@@ -11,7 +11,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, UInt8
 
 from rsjax.config import ConfigError, LoopConfig, content_key, from_dict, to_dict
 from rsjax.errors import UserError
@@ -43,12 +43,24 @@ class Policy:
     @cached_property
     def key(self) -> str:
         """A hash of all that actions depend on: weights, range and settings except those of training."""
-        model = replace(self.model, config=replace(self.model.config, train=LoopConfig()))
+        model = without_training(self.model)
         return content_key("policy", str(model), str(self.range), fingerprint((self.params,)))
 
     def actor(self, seed: int = 0) -> "Actor":
         """Returns an actor for new episodes; the seed determines its draws."""
         return Actor(self, seed)
+
+    def plans(self, frames: UInt8[np.ndarray, "T S S 3"], count: int, seed: int) -> Float32[np.ndarray, "N F A"]:
+        """Returns several plans for the frames that follow, each with its own draws: an action for each frame.
+
+        Args:
+            frames: those so far; the first is repeated if the policy observes more.
+        """
+        model = self.model
+        seen = np.maximum(np.arange(len(frames) - model.config.observations, len(frames)), 0)
+        alike = np.repeat(frames[None, seen], count, axis=0)
+        plan = _plan(without_training(model), self.params, alike, jax.random.key(seed))
+        return self.range.unscale(np.asarray(plan)).reshape(count, -1, self.action_dim)
 
     def save(self, directory: Path) -> None:
         """Writes what :func:`load_policy` reads; ``policy.json`` comes last, so a policy that has one is complete."""
@@ -87,8 +99,7 @@ class Actor:
     """
 
     def __init__(self, policy: Policy, seed: int) -> None:
-        # No training settings, so that policies trained for different numbers of steps share one compiled program.
-        self._model = replace(policy.model, config=replace(policy.model.config, train=LoopConfig()))
+        self._model = without_training(policy.model)
         self._policy = policy
         self._key = jax.random.key(seed)
         self._seen: list[np.ndarray] = []
@@ -122,6 +133,11 @@ class Actor:
         assert self._plan is not None
         controls = self._plan[:, place * model.controls : (place + 1) * model.controls]
         return controls.reshape(len(frames), -1)
+
+
+def without_training(model: DiffusionPolicy) -> DiffusionPolicy:
+    """Returns the model without training settings, so that policies of different trainings share one program."""
+    return replace(model, config=replace(model.config, train=LoopConfig()))
 
 
 @partial(jax.jit, static_argnums=0)  # one program for all policies of one size

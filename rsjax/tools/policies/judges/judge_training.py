@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +19,11 @@ from rsjax.models.trained import TrainedModel
 from rsjax.progress import Progress
 from rsjax.tools.pipeline.run import Run
 from rsjax.tools.pipeline.run_clips import relocated
-from rsjax.tools.policies.judges.judge import Judge
+from rsjax.tools.policies.judges.head_judge import FOLDER as HEAD_FOLDER
+from rsjax.tools.policies.judges.head_judge import HeadJudge, head_judge
+from rsjax.tools.policies.judges.judge import FAIL, LABELS, SUCCESS, Judge
 from rsjax.tools.policies.judges.trained_judge import VALIDATION, Footage, load_judge, train_judge
-from rsjax.tools.policies.judges.validation import validate
+from rsjax.tools.policies.judges.validation import outcomes, scores, validate
 
 FOLDER = "judge"  # in the run directory
 FITTED = 10  # every tenth training clip serves to fit the temperature instead
@@ -36,6 +38,10 @@ class JudgeSettings:
         clips: training clips, at most.
         reconstructed: how many of these clips the judge also sees as the tokenizer reconstructs them, so that it knows
             the look of generated frames; their labels are the simulator's too.
+        generated: how many of these clips the judge also sees as the model generates them under their own actions. The
+            labels are the simulator's of the same actions: where the model lifts a cube that slipped in the simulator,
+            the judge learns to call it a failure.
+        in_a_row: how many frames in a row must show success.
         validation_clips: held-out clips, at most.
         seed: seed of the training.
     """
@@ -43,13 +49,16 @@ class JudgeSettings:
     steps: int = 1000
     clips: int = 1000
     reconstructed: int = 200
+    generated: int = 0
+    in_a_row: int = 1
     validation_clips: int = 100
     seed: int = 0
 
     def __post_init__(self) -> None:
         require_range(self, "judge", 1, math.inf, "steps", "validation_clips")
         require_range(self, "judge", 2, math.inf, "clips")
-        require_range(self, "judge", 0, 2**32 - 1, "reconstructed", "seed")
+        require_range(self, "judge", 0, 2**32 - 1, "reconstructed", "generated", "seed")
+        require_range(self, "judge", 1, 16, "in_a_row")
 
 
 def judge_of(run: Path | str | TrainedModel, judge: Judge | Path | str | None, side: int) -> Judge | None:
@@ -84,13 +93,9 @@ def make_judge(
     """
     settings = settings or JudgeSettings()
     trained = load(run)
-    if store:
-        config = relocated(trained.config, store)
-    else:
-        config = trained.config
-    clips = Run(config, run, data_dir).open_clips()
+    clips = _clips_of(trained, run, data_dir, store)
     learned, fitted = _training(trained, clips, settings)
-    judge = train_judge(learned, fitted, settings.steps, settings.seed)
+    judge = replace(train_judge(learned, fitted, settings.steps, settings.seed), in_a_row=settings.in_a_row)
     numbers = spread(clips.source("test"), settings.validation_clips)
     held = [clip for _, clip in readable(clips.source("test"), numbers)]
     result = validation(trained, judge, held) | {"settings": vars(settings), "judge": judge.key}
@@ -104,46 +109,93 @@ def validation(trained: TrainedModel, judge: Judge, clips: Sequence[Record]) -> 
     held = Clips.stacked(clips, range(len(clips)))
     first = trained.config.prompt_frames
     raw = Footage(held.rgb, held.success)
-    video = held.video
-    made = []
     result = {"clips": len(clips), "raw": validate(judge, raw, first, spoil=True)}
     if (seen := _reconstructed(trained, raw.rgb)) is not None:
         result["reconstructed"] = validate(judge, Footage(seen, raw.success), first)
+    made = imagined(trained, held)
+    return result | {"generated": validate(judge, Footage(made.rgb, raw.success), first)}
+
+
+def validate_heads(
+    run: Path, data_dir: Path, store: Path | None = None, settings: JudgeSettings | None = None
+) -> dict[str, Any]:
+    """Validates a model's own success head as a judge, and writes the result to ``RUN/judge_head/validation.json``.
+
+    Raises:
+        UserError: the run or its clips are missing, or the model has no state heads.
+    """
+    settings = settings or JudgeSettings()
+    trained = load(run)
+    head_judge(trained, run)
+    source = _clips_of(trained, run, data_dir, store).source("test")
+    held = [clip for _, clip in readable(source, spread(source, settings.validation_clips))]
+    result = head_validation(trained, HeadJudge(settings.in_a_row), held) | {"settings": vars(settings)}
+    write_json(run / HEAD_FOLDER / VALIDATION, result)
+    return result
+
+
+def head_validation(trained: TrainedModel, judge: HeadJudge, clips: Sequence[Record]) -> dict[str, Any]:
+    """Validates a model's own success head on true frames, each predicted from those before it, and on rollouts."""
+    held = Clips.stacked(clips, range(len(clips)))
+    first = trained.config.prompt_frames
+    success = held.success[:, first:]
+    truth = np.where(success, SUCCESS, FAIL).ravel()
+    forced = trained.model.teacher_forced(trained.params, trained.assets, held.video, held.actions, first)
+    made = imagined(trained, held).frames(first)
+    assert forced is not None and forced.state is not None and made.state is not None
+    result: dict[str, Any] = {"clips": len(clips), "judge": judge.key, "in_a_row": judge.in_a_row}
+    for kind, state in (("raw", forced.state), ("generated", made.state)):
+        each = [judge.read(state[:, : t + 1]) for t in range(state.shape[1])]
+        single = [HeadJudge().read(state[:, : t + 1]) for t in range(state.shape[1])]
+        result[kind] = scores(np.stack(each, 1).reshape(-1, len(LABELS)), truth)
+        result[kind]["whole_clips"] = outcomes(np.stack(single), success)
+    return result
+
+
+def imagined(trained: TrainedModel, clips: Clips) -> Video:
+    """Returns the videos that the model generates from the clips' first frames under their own actions."""
     size = trained.config.eval.batch_size
-    with Progress("judge's videos", len(clips), "videos") as progress:
-        for start in range(0, len(clips), size):
-            rows = np.minimum(np.arange(start, start + size), len(clips) - 1)  # batches of one shape
-            prompt = video[rows].frames(0, first)
-            inputs = (trained.params, trained.assets, prompt, held.actions[rows])
-            made.append(trained.model.generate(*inputs, index=rows, depth=False).rgb)
-            progress.update(min(start + size, len(clips)))
-    generated = np.concatenate(made)[: len(clips)]
-    return result | {"generated": validate(judge, Footage(generated, raw.success), first)}
+    count = len(clips.rgb)
+    parts = []
+    with Progress("judge's videos", count, "videos") as progress:
+        for start in range(0, count, size):
+            rows = np.minimum(np.arange(start, start + size), count - 1)  # batches of one shape
+            prompt = clips.video[rows].frames(0, trained.config.prompt_frames)
+            inputs = (trained.params, trained.assets, prompt, clips.actions[rows])
+            parts.append(trained.model.generate(*inputs, index=rows, depth=False)[: count - start])
+            progress.update(min(start + size, count))
+    states = [part.state for part in parts if part.state is not None]
+    return Video(np.concatenate([part.rgb for part in parts]), state=np.concatenate(states) if states else None)
+
+
+def _clips_of(trained: TrainedModel, run: Path, data_dir: Path, store: Path | None) -> Store:
+    if store:
+        config = relocated(trained.config, store)
+    else:
+        config = trained.config
+    return Run(config, run, data_dir).open_clips()
 
 
 def _training(trained: TrainedModel, clips: Store, settings: JudgeSettings) -> tuple[Footage, Footage]:
-    """Returns the videos to learn from and the videos to fit the temperature on, each raw and reconstructed."""
+    """Returns the videos to learn from and those to fit the temperature on: raw, reconstructed and generated ones."""
     source = clips.source("train")
     records = [clip for _, clip in readable(source, spread(source, settings.clips))]
     if len(records) < 2:
         raise UserError(f"{clips.path}: {len(records)} readable training clips; a judge needs 2 at least")
     raw = Footage(*(np.stack([clip[name] for clip in records]) for name in ("rgb", "success")))
+    parts = [raw]
     seen = _reconstructed(trained, raw.rgb[: settings.reconstructed])
-    if seen is None:
-        rgb = raw.rgb
-    else:
-        rgb = np.concatenate([raw.rgb, seen])
-    if seen is None:
-        success = raw.success
-    else:
-        success = np.concatenate([raw.success, raw.success[: len(seen)]])
-    if len(raw.rgb) >= FITTED:
-        held = np.arange(len(rgb)) % len(raw.rgb) % FITTED == FITTED - 1
-    else:
-        held = None
-    if held is None:  # so few clips serve both purposes
-        return Footage(rgb, success), Footage(rgb, success)
-    return Footage(rgb[~held], success[~held]), Footage(rgb[held], success[held])
+    if seen is not None:
+        parts.append(Footage(seen, raw.success[: len(seen)]))
+    if settings.generated:
+        some = Clips.stacked(records[: settings.generated], range(min(len(records), settings.generated)))
+        parts.append(Footage(imagined(trained, some).rgb, some.success))
+    numbers = np.concatenate([np.arange(len(part.rgb)) for part in parts])  # of the clips
+    whole = Footage(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("rgb", "success")))
+    if len(raw.rgb) < FITTED:  # so few clips serve both purposes
+        return whole, whole
+    held = numbers % FITTED == FITTED - 1
+    return Footage(whole.rgb[~held], whole.success[~held]), Footage(whole.rgb[held], whole.success[held])
 
 
 def _reconstructed(trained: TrainedModel, rgb: np.ndarray) -> np.ndarray | None:

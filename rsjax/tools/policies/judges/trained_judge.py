@@ -27,7 +27,16 @@ from rsjax.evaluation.results import fingerprint
 from rsjax.files import read_json, write_file
 from rsjax.layers.group_norm import GroupNorm
 from rsjax.progress import Progress
-from rsjax.tools.policies.judges.judge import FAIL, HISTORY, LABELS, SUCCESS, UNINTERPRETABLE, last_frames
+from rsjax.tools.policies.judges.judge import (
+    FAIL,
+    HISTORY,
+    LABELS,
+    SUCCESS,
+    UNINTERPRETABLE,
+    all_successes,
+    frames_of,
+    last_frames,
+)
 
 FILE = "judge.msgpack"
 VALIDATION = "validation.json"
@@ -59,20 +68,27 @@ class TrainedJudge:
     Attributes:
         side: of the frames that it was trained on, pixels.
         validation: the content of its ``validation.json``, if it was validated.
+        in_a_row: how many frames in a row must show success.
     """
 
     params: Any
     temperature: float
     side: int
     validation: dict[str, Any] | None = None
+    in_a_row: int = 1
 
     @cached_property
     def key(self) -> str:
-        """A hash of the weights and the temperature."""
-        return content_key("judge", fingerprint((self.params,)), self.temperature)
+        """A hash of the weights, the temperature and, above 1, the number of frames in a row."""
+        rows = [self.in_a_row] if self.in_a_row > 1 else []
+        return content_key("judge", fingerprint((self.params,)), self.temperature, *rows)
 
     def __call__(self, frames: UInt8[np.ndarray, "B T H W 3"]) -> Float[np.ndarray, "B 3"]:
-        history = last_frames(frames)
+        whole = last_frames(frames, frames_of(self))
+        return all_successes(np.stack([self._one(whole[:, place : place + HISTORY]) for place in range(self.in_a_row)]))
+
+    def _one(self, history: UInt8[np.ndarray, "B F H W 3"]) -> Float[np.ndarray, "B 3"]:
+        """Returns the verdicts at the ends of histories, each by itself."""
         parts = []
         for start in range(0, len(history), CHUNK):
             parts.append(np.asarray(_probabilities(self.params, self.temperature, history[start : start + CHUNK])))
@@ -81,7 +97,8 @@ class TrainedJudge:
     def save(self, folder: Path) -> None:
         """Writes what :func:`load_judge` reads, atomically."""
         arrays = {"/".join(path): np.asarray(x) for path, x in flatten_dict(self.params).items()}
-        write_file(folder / FILE, encode(arrays | {"temperature": self.temperature, "side": self.side}))
+        numbers = {"temperature": self.temperature, "side": self.side, "in_a_row": self.in_a_row}
+        write_file(folder / FILE, encode(arrays | numbers))
 
 
 def load_judge(folder: Path, side: int | None = None) -> TrainedJudge:
@@ -99,6 +116,7 @@ def load_judge(folder: Path, side: int | None = None) -> TrainedJudge:
         record = decode(path.read_bytes())
         temperature = float(record.pop("temperature"))
         trained_on = int(record.pop("side"))
+        in_a_row = int(record.pop("in_a_row", 1))
     except FileNotFoundError as error:
         raise UserError(f"{path}: no judge there; train one with python -m experiments.judge RUN") from error
     except (OSError, ValueError, KeyError) as error:
@@ -109,7 +127,7 @@ def load_judge(folder: Path, side: int | None = None) -> TrainedJudge:
             f"one on such frames with python -m experiments.judge RUN"
         )
     params = unflatten_dict({tuple(name.split("/")): x for name, x in record.items()})
-    judge = TrainedJudge(params, temperature, trained_on)
+    judge = TrainedJudge(params, temperature, trained_on, in_a_row=in_a_row)
     if report.exists():
         found = read_json(report, cure="train the judge again")
     else:
@@ -132,9 +150,11 @@ class Footage:
     rgb: UInt8[np.ndarray, "N T H W 3"]
     success: Bool[np.ndarray, "N T"]
 
-    def histories(self, videos: Int[np.ndarray, " B"], frames: Int[np.ndarray, " B"]) -> UInt8[np.ndarray, "B F H W 3"]:
-        """Returns the history that ends at the given frame, for each given video."""
-        back = np.maximum(frames[:, None] - np.arange(HISTORY)[::-1], 0)
+    def histories(
+        self, videos: Int[np.ndarray, " B"], frames: Int[np.ndarray, " B"], count: int = HISTORY
+    ) -> UInt8[np.ndarray, "B F H W 3"]:
+        """Returns the ``count`` frames that end at the given frame, for each given video."""
+        back = np.maximum(frames[:, None] - np.arange(count)[::-1], 0)
         return self.rgb[videos[:, None], back]
 
 

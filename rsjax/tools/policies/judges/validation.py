@@ -5,17 +5,28 @@ are always the simulator's. On generated videos the model's errors count as the 
 cube that was lifted in the clip, a correct judge says "fail" but the label is "success".
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from rsjax.evaluation.statistics import wilson
-from rsjax.tools.policies.judges.judge import FAIL, LABELS, SUCCESS, UNINTERPRETABLE, Judge
+from rsjax.tools.policies.judges.judge import (
+    FAIL,
+    LABELS,
+    SUCCESS,
+    UNINTERPRETABLE,
+    Judge,
+    all_successes,
+    frames_of,
+    of_single_frames,
+)
 from rsjax.tools.policies.judges.trained_judge import Footage, spoilt
 from rsjax.tools.studies.tables import ABSENT, Table, as_markdown
 
 KINDS = ("raw", "reconstructed", "generated")
+OUTCOMES = ("false_success", "false_failure", "right")
 BINS = 10
 AT_ONCE = 1024  # histories judged at once
 
@@ -29,17 +40,58 @@ def validate(judge: Judge, footage: Footage, first: int = 1, spoil: bool = False
     videos, frames = (each.ravel() for each in np.indices(footage.success.shape)[:, :, first:])
     truth = np.where(footage.success[videos, frames], SUCCESS, FAIL)
     rng = np.random.default_rng(0)
-    probabilities = []
-    labels = []
-    for start in range(0, len(videos), AT_ONCE):
-        rows = slice(start, start + AT_ONCE)
-        history = footage.histories(videos[rows], frames[rows])
-        probabilities.append(judge(history))
-        labels.append(truth[rows])
-        if spoil:
-            probabilities.append(judge(spoilt(history, np.roll(history, len(history) // 2, axis=0), rng)))
-            labels.append(np.full(len(history), UNINTERPRETABLE))
-    return scores(np.concatenate(probabilities), np.concatenate(labels))
+
+    def verdicts(judge: Judge, spoil: bool = False) -> Float[np.ndarray, "N 3"]:
+        parts = []
+        for start in range(0, len(videos), AT_ONCE):
+            rows = slice(start, start + AT_ONCE)
+            history = footage.histories(videos[rows], frames[rows], frames_of(judge))
+            if spoil:
+                history = spoilt(history, np.roll(history, len(history) // 2, axis=0), rng)
+            parts.append(judge(history))
+        return np.concatenate(parts)
+
+    probabilities = verdicts(judge)
+    labels = truth
+    single = probabilities
+    if spoil:
+        probabilities = np.concatenate([probabilities, verdicts(judge, spoil=True)])
+        labels = np.concatenate([truth, np.full(len(truth), UNINTERPRETABLE)])
+    if of_single_frames(judge) is not judge:
+        single = verdicts(of_single_frames(judge))
+    by_frame = single.reshape(len(footage.success), -1, len(LABELS)).swapaxes(0, 1)
+    return scores(probabilities, labels) | {"whole_clips": outcomes(by_frame, footage.success[:, first:])}
+
+
+def outcomes(
+    verdicts: Float[np.ndarray, "T N 3"], success: Bool[np.ndarray, "N T"], in_a_row: Sequence[int] = (1, 2)
+) -> dict[str, dict[str, list[float | None]]]:
+    """Returns how whole clips are judged if one frame, or several in a row, must show success, ready for JSON.
+
+    A clip succeeds if one of its frames does: an episode in a world ends there.
+
+    Args:
+        verdicts: of single frames.
+        success: the simulator's, of the same frames.
+
+    Returns:
+        By number of frames: the share of clips called a success among those that fail (``false_success``), the share
+        not called one among those that succeed (``false_failure``), and the share that is ``right``, each with its
+        Wilson interval.
+    """
+    truth = np.asarray(success.any(axis=1))
+    found: dict[str, dict[str, list[float | None]]] = {}
+    for count in in_a_row:
+        each = [all_successes(verdicts[max(0, t - count + 1) : t + 1]) for t in range(len(verdicts))]
+        called = (np.stack(each).argmax(-1) == SUCCESS).any(axis=0)
+        counts = {
+            "false_success": (int((called & ~truth).sum()), int((~truth).sum())),
+            "false_failure": (int((~called & truth).sum()), int(truth.sum())),
+            "right": (int((called == truth).sum()), len(truth)),
+        }
+        rates = {name: wilson(*pair) for name, pair in counts.items() if pair[1]}
+        found[str(count)] = {name: [rate.value, rate.low, rate.high] for name, rate in rates.items()}
+    return found
 
 
 def scores(probabilities: Float[np.ndarray, "N 3"], truth: Int[np.ndarray, " N"]) -> dict[str, Any]:
@@ -94,7 +146,22 @@ def markdown(judge: dict[str, Any] | None) -> list[str]:
         counts = [" / ".join(map(str, row)) if any(row) else ABSENT for row in part["confusion"]]
         rows.append([kind, *counts, f"{100 * part['right'][0]:.1f} %", f"{part['calibration_error']:.3f}"])
     table = as_markdown(Table(("video", *LABELS, "right", "calibration error"), rows))
-    return ["", f"The judge on held-out clips (frames called {found}, by what they are):", "", table]
+    lines = ["", f"The judge on held-out clips (frames called {found}, by what they are):", "", table]
+    if whole := whole_clips(judge):
+        lines += ["", "Whole clips, by how many frames in a row must show success:", "", as_markdown(whole)]
+    return lines
+
+
+def whole_clips(result: dict[str, Any]) -> Table | None:
+    """Returns the :func:`outcomes` of a validation as a table; None for a validation of an older version."""
+    rows = []
+    for kind in KINDS:
+        for count, rates in result.get(kind, {}).get("whole_clips", {}).items():
+            shares = [f"{100 * rates[name][0]:.1f} %" if name in rates else ABSENT for name in OUTCOMES]
+            rows.append([kind, count, *shares])
+    if not rows:
+        return None
+    return Table(("video", "frames", *(name.replace("_", " ") for name in OUTCOMES)), rows)
 
 
 def table(result: dict[str, Any]) -> Table:

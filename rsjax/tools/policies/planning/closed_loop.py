@@ -5,10 +5,12 @@ of the scripted expert's episode from the same start; the planner does not see h
 """
 
 import time
+import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 from jaxtyping import Float32, UInt8
@@ -21,20 +23,20 @@ from rsjax.evaluation.statistics import wilson
 from rsjax.files import content_hash, write_file, write_json
 from rsjax.models.trained import TrainedModel
 from rsjax.progress import Progress
-from rsjax.tools.policies.judges.judge import judge_key
+from rsjax.tools.policies.judges.judge import frames_of, judge_key
 from rsjax.tools.policies.judges.judge_training import FOLDER
 from rsjax.tools.policies.judges.trained_judge import load_judge
 from rsjax.tools.policies.judges.validation import markdown, summary
 from rsjax.tools.policies.planning.energies import (
-    Score,
     Seen,
     imagined,
     judged,
     lpips_distance,
     pixel_distance,
+    success,
     token_distance,
 )
-from rsjax.tools.policies.planning.planner import Planner, PlannerConfig
+from rsjax.tools.policies.planning.planner import Energy, Planner, PlannerConfig
 from rsjax.tools.policies.policy import Policy
 from rsjax.tools.policies.studies.trials import FPS
 from rsjax.tools.policies.worlds.actions import check_takes_actions
@@ -44,7 +46,7 @@ from rsjax.tools.sim.expert import skilled_expert
 from rsjax.tools.studies.report.video import write_mp4
 from rsjax.tools.studies.tables import ABSENT, Table, as_markdown
 
-EnergyName: TypeAlias = Literal["judge", "tokens", "pixels", "lpips"]
+EnergyName: TypeAlias = Literal["judge", "success", "tokens", "pixels", "lpips"]
 MakeActor: TypeAlias = Callable[[int, UInt8[np.ndarray, "S S 3"]], Actor]  # from an episode's seed and goal image
 MEMORY = 2  # frames in the world model's prompt; one at an episode's beginning
 HEADINGS = ("way to act", "success", "95 % interval", "steps", "seconds a decision", "numbers clipped")
@@ -58,11 +60,13 @@ class PlanSettings:
     Attributes:
         planner: how the planner searches; its ``method`` is replaced by each of ``methods``.
         methods: planning methods to compare.
-        energy: "judge": 1 - the probability of success according to the run's judge; otherwise the distance of the
-            last frame to the goal image, in the model's tokens, in pixels, or in LPIPS.
+        energy: "judge": 1 - the probability of success according to the run's judge; "success": according to the
+            model's own success head; otherwise the distance of the last frame to the goal image, in the model's tokens,
+            in pixels, or in LPIPS.
         lpips_weights: a file of weights for "lpips".
         episodes: number of episodes, with seeds from ``FIRST_SEED`` on.
         max_steps: steps of an episode, at most.
+        warm_start: whether each method also plans with a policy's plans among its candidates, for every policy.
     """
 
     planner: PlannerConfig = field(default_factory=PlannerConfig)
@@ -71,10 +75,11 @@ class PlanSettings:
     lpips_weights: str = ""
     episodes: int = 50
     max_steps: int = 20
+    warm_start: bool = False
 
     def __post_init__(self) -> None:
         require_range(self, "plan", 1, 2**31, "episodes", "max_steps")
-        known = ("judge", "tokens", "pixels", "lpips")
+        known = get_args(EnergyName)
         require(self.energy in known, f"plan.energy is {self.energy!r}; it is one of {', '.join(known)}")
         require(self.energy != "lpips" or bool(self.lpips_weights), "plan.energy is lpips; it needs lpips_weights")
 
@@ -114,25 +119,36 @@ class PlanningActor:
         return action[None]
 
 
-def score_of(trained: TrainedModel, run: Path, settings: PlanSettings, goal: UInt8[np.ndarray, "S S 3"]) -> Score:
-    """Returns the score that a planner minimises.
+def energy_of(trained: TrainedModel, run: Path, settings: PlanSettings, goal: UInt8[np.ndarray, "S S 3"]) -> Energy:
+    """Returns the energy that a planner minimises.
 
     Raises:
-        UserError: the run has no judge for its frames, its model has no tokens, or the weights are missing or damaged.
+        UserError: the run has no judge for its frames, its model has no tokens or no state heads, or the weights are
+            missing or damaged.
     """
+    if settings.energy == "success":
+        return success(trained)
     if settings.energy == "judge":
-        return judged(load_judge(run / FOLDER, len(goal)))
+        judge = load_judge(run / FOLDER, len(goal))
+        return imagined(trained, judged(judge), frames_of(judge))
     if settings.energy == "tokens":
-        return token_distance(trained, goal)
+        return imagined(trained, token_distance(trained, goal))
     if settings.energy == "pixels":
-        return pixel_distance(goal)
-    return lpips_distance(Path(settings.lpips_weights), goal)
+        return imagined(trained, pixel_distance(goal))
+    return imagined(trained, lpips_distance(Path(settings.lpips_weights), goal))
 
 
 def actors(
-    trained: TrainedModel, run: Path, settings: PlanSettings, others: dict[str, MakeActor] | None = None
+    trained: TrainedModel, run: Path, settings: PlanSettings, policies: Mapping[str, Policy] | None = None
 ) -> dict[str, MakeActor]:
-    """Returns the ways to act by name: random, expert, the given others, and the planner with each method."""
+    """Returns the ways to act by name: random, expert, the policies, and the planner with each method.
+
+    With ``settings.warm_start`` there is also the planner with each method and policy, named "METHOD from POLICY".
+
+    Raises:
+        UserError: a policy's actions or frames differ in size from those of the run's clips.
+    """
+    policies = policies or {}
     config = trained.config
     depth = config.model.uses_depth and trained.assets.normalization.depth_range is not None
     high = np.ones(config.clips.action_dim)
@@ -142,12 +158,15 @@ def actors(
         rng = np.random.default_rng(seed)
         return lambda observation: np.tile(rng.uniform(-1, 1, len(high) // controls), controls)[None]
 
-    def planning(method: str) -> MakeActor:
+    def planning(method: str, policy: Policy | None = None) -> MakeActor:
         search = PlannerConfig(**asdict(settings.planner) | {"method": method, "hold": controls})
 
         def make(seed: int, goal: np.ndarray) -> Actor:
-            energy = imagined(trained, score_of(trained, run, settings, goal))
-            return PlanningActor(Planner(energy, -high, high, search), len(high), depth)
+            propose = None
+            if policy is not None:
+                propose = partial(_proposals, policy, search.candidates // 2, seed)
+            planner = Planner(energy_of(trained, run, settings, goal), -high, high, search, propose)
+            return PlanningActor(planner, len(high), depth)
 
         return make
 
@@ -155,7 +174,18 @@ def actors(
         scripted = skilled_expert(seed)
         return lambda observation: [scripted.act]
 
-    return {"random": random, "expert": expert, **(others or {}), **{name: planning(name) for name in settings.methods}}
+    ways: dict[str, MakeActor] = {"random": random, "expert": expert}
+    ways |= {name: policy_actor(name, policy, trained) for name, policy in policies.items()}
+    for method in settings.methods:
+        ways[method] = planning(method)
+        if settings.warm_start:
+            ways |= {f"{method} from {name}": planning(method, policy) for name, policy in policies.items()}
+    return ways
+
+
+def _proposals(policy: Policy, count: int, seed: int, seen: Seen) -> Float32[np.ndarray, "N F A"]:
+    """Returns a policy's plans for what a planner has seen, with other draws at each frame."""
+    return policy.plans(seen.rgb, count, zlib.crc32(seen.rgb.tobytes(), seed) >> 1)
 
 
 def policy_actor(name: str, policy: Policy, trained: TrainedModel) -> MakeActor:
@@ -201,9 +231,13 @@ def compare(
         raise UserError(f"{run}: its clips are recordings; a closed loop needs a run on simulated clips")
     check_takes_actions(config.model, f"{run}: the model")
     policies = policies or {}
-    others = {name: policy_actor(name, policy, trained) for name, policy in policies.items()}
-    ways = actors(trained, run, settings, others)
-    score_of(trained, run, settings, np.zeros((config.sim.image_size, config.sim.image_size, 3), np.uint8))  # may raise
+    require(
+        bool(policies) or not settings.warm_start,
+        "plan.warm_start is on, but there is no policy to start from; name one with --policy",
+    )
+    ways = actors(trained, run, settings, policies)
+    side = config.sim.image_size
+    energy_of(trained, run, settings, np.zeros((side, side, 3), np.uint8))  # raises before hours of episodes
     judge = None
     validation = None
     lpips = ""

@@ -12,14 +12,16 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
 from rsjax.clip import Video
+from rsjax.data.state_labels import STATE
 from rsjax.errors import UserError
 from rsjax.evaluation.metrics.lpips import distances
 from rsjax.models.trained import TrainedModel
 from rsjax.tokenizers.lpips import load_lpips, min_size
+from rsjax.tools.policies.judges.head_judge import head_judge
 from rsjax.tools.policies.judges.judge import HISTORY, SUCCESS, Judge
 from rsjax.tools.policies.planning.planner import Energy
 
-# From the last F frames (at most ``HISTORY``) of N generated videos to their scores (N,); lower is better.
+# From the last F frames of N generated videos to their scores (N,); lower is better.
 Score: TypeAlias = Callable[[UInt8[np.ndarray, "N F S S 3"]], Float[np.ndarray, " N"]]
 
 
@@ -38,20 +40,43 @@ class Seen:
     actions: Float32[np.ndarray, "P A"]
 
 
-def imagined(model: TrainedModel, score: Score) -> Energy:
+def imagined(model: TrainedModel, score: Score, frames: int = HISTORY) -> Energy:
     """Returns an energy: the score of the video that a world model generates for each candidate.
 
     All candidates share the cache of the frames so far, and the random draws. The energy takes a :class:`Seen`.
+
+    Args:
+        frames: how many of the last frames the score looks at.
     """
 
+    return lambda seen, candidates: score(_planned(model, seen, candidates, frames).rgb)
+
+
+def success(model: TrainedModel) -> Energy:
+    """Returns an energy: 1 - the probability of success that the model's own head reads at each candidate's end.
+
+    It takes a :class:`Seen`, and decodes no picture but the last.
+
+    Raises:
+        UserError: the model has no state heads.
+    """
+    head_judge(model)
+
     def energy(seen: Seen, candidates: Float[np.ndarray, "N H A"]) -> Float[np.ndarray, " N"]:
-        before = np.repeat(seen.actions[None], len(candidates), axis=0)
-        prompt = Video(seen.rgb[None], None if seen.depth is None else seen.depth[None])
-        actions = np.concatenate([before, candidates], axis=1)
-        last = min(HISTORY, candidates.shape[1])
-        return score(model.model.plan(model.params, model.assets, prompt, actions, depth=False, last=last).rgb)
+        state = _planned(model, seen, candidates, 1).state
+        assert state is not None
+        return 1 - state[:, -1, STATE.index("success")].astype(np.float64)
 
     return energy
+
+
+def _planned(model: TrainedModel, seen: Seen, candidates: Float[np.ndarray, "N H A"], frames: int) -> Video:
+    """Returns the last frames of the videos that the model generates for the candidates."""
+    before = np.repeat(seen.actions[None], len(candidates), axis=0)
+    prompt = Video(seen.rgb[None], None if seen.depth is None else seen.depth[None])
+    actions = np.concatenate([before, candidates], axis=1)
+    last = min(frames, candidates.shape[1])
+    return model.model.plan(model.params, model.assets, prompt, actions, depth=False, last=last)
 
 
 def pixel_distance(goal: UInt8[np.ndarray, "S S 3"]) -> Score:

@@ -20,6 +20,8 @@ from rsjax.errors import UserError
 # From the planner's input (any type) and N candidates (N, H, A) to energies (N,); lower is better, inf excludes one.
 Energy: TypeAlias = Callable[[Any, Float[np.ndarray, "N H A"]], Float[np.ndarray, " N"]]
 
+Propose: TypeAlias = Callable[[Any], Float[np.ndarray, "N H A"]]
+
 
 @dataclass(frozen=True)
 class PlannerConfig:
@@ -87,6 +89,7 @@ def search(
     high: Float[np.ndarray, " A"],
     config: PlannerConfig,
     rng: np.random.Generator,
+    proposals: Float[np.ndarray, "N H A"] | None = None,
 ) -> Plan:
     """Searches for the action sequence of least energy.
 
@@ -96,6 +99,7 @@ def search(
         mean: where the search begins.
         low: least actions; candidates are clipped to [low, high].
         high: greatest actions.
+        proposals: further candidates of the first round, in place of drawn ones; as many of them as there is room for.
 
     Raises:
         UserError: the energies have the wrong shape, or one is NaN or -inf.
@@ -104,10 +108,13 @@ def search(
     best = mean
     lowest = np.inf
     history = []
-    for _ in range(config.rounds):
+    for number in range(config.rounds):
         drawn = mean + deviation * _noise(config, len(low), rng)
         drawn[0] = mean
         drawn[1] = best
+        if proposals is not None and number == 0:
+            some = proposals[: len(drawn) - 2]
+            drawn[2 : 2 + len(some)] = some
         drawn = np.clip(drawn, low, high)
         energies = _checked(energy(frames, drawn.astype(np.float32)), len(drawn))
         first = int(energies.argmin())
@@ -137,6 +144,8 @@ class Planner:
         low: least actions.
         high: greatest actions.
         config: how it searches.
+        propose: returns action sequences (N, H, A) from the energy's first argument, such as a policy's plans. They are
+            candidates of every search, and the first search begins with the first of them.
 
     Attributes:
         plan: the plan of the last decision; None before the first decision.
@@ -146,7 +155,12 @@ class Planner:
     """
 
     def __init__(
-        self, energy: Energy, low: Float[np.ndarray, " A"], high: Float[np.ndarray, " A"], config: PlannerConfig
+        self,
+        energy: Energy,
+        low: Float[np.ndarray, " A"],
+        high: Float[np.ndarray, " A"],
+        config: PlannerConfig,
+        propose: Propose | None = None,
     ) -> None:
         require(
             len(low) % config.hold == 0,
@@ -154,6 +168,7 @@ class Planner:
         )
         self._energy = energy
         self._config = config
+        self._propose = propose
         self._low, self._high = (np.asarray(each)[: len(low) // config.hold] for each in (low, high))
         self.reset()
 
@@ -168,14 +183,21 @@ class Planner:
         Args:
             frames: the first argument of the energy.
         """
-        middle = np.tile((self._low + self._high) / 2, (self._config.horizon, 1))
-        if self.plan is None:
-            mean = middle
-        else:
+        mean = np.tile((self._low + self._high) / 2, (self._config.horizon, 1))
+        proposals = None
+        if self._propose is not None:
+            proposals = self._fitted(self._propose(frames))
+            mean = proposals[0]
+        if self.plan is not None:
             mean = np.concatenate([self.plan.actions[1:], self.plan.actions[-1:]])
         limits = (self._low, self._high)
-        self.plan = search(self._held, frames, mean, *limits, self._config, self._rng)
+        self.plan = search(self._held, frames, mean, *limits, self._config, self._rng, proposals)
         return np.tile(self.plan.actions[0], self._config.hold)
+
+    def _fitted(self, proposals: Float[np.ndarray, "N F A"]) -> Float[np.ndarray, "N H a"]:
+        """Returns proposals as long as the horizon (the last action goes on), as means of an action's controls."""
+        rows = np.minimum(np.arange(self._config.horizon), proposals.shape[1] - 1)
+        return proposals[:, rows].reshape(len(proposals), len(rows), self._config.hold, -1).mean(axis=2)
 
     def _held(self, frames: Any, candidates: Float[np.ndarray, "N H a"]) -> Float[np.ndarray, " N"]:
         return self._energy(frames, np.tile(candidates, (1, 1, self._config.hold)))

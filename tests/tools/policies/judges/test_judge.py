@@ -46,7 +46,9 @@ def test_a_judge_tells_success_from_failure_and_from_spoilt_frames(judge: Traine
     facts = summary({"clips": 20, "raw": result})
     assert facts is not None and facts["raw"]["confusion"] == result["confusion"] and "bins" not in facts["raw"]
     cells = [" / ".join(map(str, row)) for row in result["confusion"]]
-    assert f"| raw | {' | '.join(cells)} | {100 * result['right'][0]:.1f} % |" in " ".join(markdown(facts)[-1].split())
+    assert f"| raw | {' | '.join(cells)} | {100 * result['right'][0]:.1f} % |" in " ".join(
+        " ".join(markdown(facts)).split()
+    )
 
 
 def test_a_judge_comes_back_from_its_file_and_damage_is_named(judge: TrainedJudge, tmp_path: Path) -> None:

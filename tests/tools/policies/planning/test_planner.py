@@ -6,7 +6,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from rsjax.config import ConfigError
+from rsjax.config import ConfigError, StateHeadsConfig
 from rsjax.data.normalization import Normalization
 from rsjax.data.store import Store
 from rsjax.errors import UserError
@@ -145,6 +145,44 @@ def test_energies_are_scores_of_what_a_model_generates() -> None:
     np.testing.assert_array_equal(given[0], videos)
 
 
+def test_success_is_read_from_the_models_own_head(tmp_path: Path) -> None:
+    clips = toy.store(tmp_path / "clips")
+    with pytest.raises(UserError):
+        energies.success(toy.trained(clips))
+    model = toy.trained(clips, toy.with_model(toy.config(), state_heads=StateHeadsConfig()))
+    rgb = toy.clip(0).rgb[:2]
+    rows = np.random.default_rng(0).normal(0, 0.4, (2 + 2 * 3, 28)).astype(np.float32)
+    candidates = rows[2:].reshape(2, 3, 28)
+    found = energies.success(model)(Seen(rgb, None, rows[:2]), candidates)
+    actions = np.concatenate([np.repeat(rows[None, :2], 2, 0), candidates], 1)
+    state = model.plan(rgb, actions).state
+    assert state is not None
+    np.testing.assert_allclose(found, 1 - state[:, -1, 0], rtol=1e-5)
+    assert found[0] != found[1]
+
+
+def test_a_policys_plans_are_candidates_and_where_the_first_search_begins() -> None:
+    seen: list[np.ndarray] = []
+    way = np.array([[0.5, -0.5], [0.25, 0.75]])  # two frames of one control, held twice
+    plans = np.stack([np.tile(way, 2), np.tile(-way, 2)])
+    plans[0, 0, :2] += 0.1  # controls of a frame are averaged
+    plans[0, 0, 2:] -= 0.1
+
+    def energy(frames: Any, rows: np.ndarray) -> np.ndarray:
+        seen.append(rows)
+        return np.square(rows[:, :, :2] - np.concatenate([-way, -way[1:]])).sum((1, 2))
+
+    config = PlannerConfig(horizon=3, candidates=8, rounds=2, hold=2)
+    planner = Planner(energy, np.tile(LOW, 2), np.tile(HIGH, 2), config, lambda frames: plans)
+    action = planner(None)
+    longer = np.concatenate([way, way[1:]])
+    np.testing.assert_allclose(seen[0][0], np.tile(longer, 2), atol=1e-6)  # the mean
+    np.testing.assert_allclose(seen[0][2], np.tile(longer, 2), atol=1e-6)
+    np.testing.assert_allclose(seen[0][3], np.tile(-longer, 2), atol=1e-6)
+    np.testing.assert_allclose(action, np.tile(-way[0], 2), atol=1e-6)  # nothing can be better
+    assert planner.plan is not None and planner.plan.energy < 1e-9
+
+
 def test_the_distance_of_tokens_counts_bits(model: TrainedModel) -> None:
     frames = np.stack([toy.clip(number).rgb[:1] for number in range(2)])
     found = token_distance(model, frames[1, 0])(frames)
@@ -205,10 +243,18 @@ def test_a_comparison_resumes_and_counts(model: TrainedModel, tmp_path: Path, mo
     for number in range(2):  # another policy has another folder
         policy: Any = SimpleNamespace(action_dim=28, model=SimpleNamespace(image_size=64), key=str(number))
         policy.actor = lambda seed: lambda frames: np.ones((1, 28), np.float32)
+        policy.plans = lambda frames, count, seed: np.ones((count, 4, 28), np.float32)
         other = compare(model, tmp_path, lift(), one, {"policy a/b": policy})
         assert other["ways"]["policy a/b"]["success"] == 1
         assert (folder(tmp_path, other["key"]) / "policy a-b-00.mp4").exists()
         assert len(list((tmp_path / "plan").glob("[!.]*"))) == 2 + number
+    warm = replace(one, methods=("cem",), warm_start=True)
+    warmed = compare(model, tmp_path, lift(), warm, {"policy a/b": policy})["ways"]
+    assert list(warmed) == ["random", "expert", "policy a/b", "cem", "cem from policy a/b"]
+    assert warmed["cem from policy a/b"]["steps"] == 1  # the policy's plans press at once
+    with pytest.raises(ConfigError) as caught:
+        compare(model, tmp_path, lift(), warm)
+    assert "no policy to start from" in str(caught.value)
     monkeypatch.setattr(planning, "lpips_distance", lambda weights, goal: None)
     keys = []
     for name, content in (("a", b"1"), ("b", b"1"), ("a", b"2")):  # weights count by their content

@@ -10,7 +10,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import rsjax.tools.policies  # noqa: F401 - registers
-from rsjax.config import SampleConfig
+from rsjax.config import SampleConfig, StateHeadsConfig
 from rsjax.data.store import Store
 from rsjax.errors import UserError
 from rsjax.models.trained import TrainedModel
@@ -177,3 +177,22 @@ def test_a_family_without_steps_is_named(clips: Store) -> None:
     still: Any = replace(toy.config().model, action_encoder="none")  # type: ignore[call-arg]
     with pytest.raises(UserError, match=r"the model takes no actions \(family 'roboscape'\)"):
         WorldModelEnv(toy.trained(clips, replace(toy.config(), model=still)))
+
+
+def test_the_models_own_head_may_give_the_reward(clips: Store) -> None:
+    with pytest.raises(UserError):
+        WorldModelEnv(toy.trained(clips), judge="head")
+    model = toy.trained(clips, toy.with_model(toy.config(), state_heads=StateHeadsConfig()))
+    env = WorldModelEnv(model, judge="head", data_dir=clips.path.parent)
+    _, info = env.reset(options={"clip": 1, "draw": 0})
+    rows = actions(STEPS, 28)
+    clip = clips.source("test")[1]
+    state = model.generate(clip["rgb"][:1], np.concatenate([rows[:1], rows]), clip["depth"][:1]).state
+    assert state is not None
+    np.testing.assert_allclose([info["height"], info["opening"]], state[0, 1:], atol=1e-4)
+    for number, row in enumerate(rows, 1):
+        _, reward, terminated, _, info = env.step(row)
+        assert reward == float(terminated) == float(state[number, 0] > 0.5)
+        np.testing.assert_allclose(info["verdict"], [state[number, 0], 1 - state[number, 0], 0], atol=1e-4)
+        if terminated:
+            break
