@@ -22,7 +22,7 @@ class Options(Trials):
     data_dir: Path = Path("data")
     """Directory of simulated data sets."""
     judge: Path | None = None
-    """Folder of the judge for all runs; default: the first run's own (experiments.judge)."""
+    """Folder of the judge for all runs, or head: each model's own success head; default: the first run's judge."""
     imagined: int = 0
     """Episodes of each policy in a world model, at least --episodes; 0: four times as many as --episodes."""
     policies: tuple[Path, ...] = ()
@@ -75,7 +75,7 @@ def main() -> None:
         return
     for run in runs.values():  # checked before hours of training
         run.check_world(first)
-    first.judge(judge)
+    first.world_judge(judge)
     config = first.simulator
     imagined = options.imagined or 4 * trials.episodes
     if options.policies:
@@ -87,7 +87,7 @@ def main() -> None:
         size = sized_policy(options.size, options.steps)
         policies, training = trained_policies(size, demos, out, options.checkpoints, options.trainings)
     common_size(policies.values())
-    worlds = {name: partial(run.world, trials.together, judge) for name, run in runs.items()}
+    worlds = {name: partial(run.world, trials.together, judge, measured=True) for name, run in runs.items()}
     with open_lift(config, trials) as simulator:
         compare(
             policies,

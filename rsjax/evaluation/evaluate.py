@@ -23,9 +23,11 @@ from rsjax.config import EvalConfig
 from rsjax.config.data import ClipShape
 from rsjax.data.clips import Clips, readable, spread
 from rsjax.data.codec import Record
+from rsjax.data.state_labels import STATE, knows_success
 from rsjax.data.store import Store, StoreError
 from rsjax.devices import replicate
 from rsjax.errors import UserError
+from rsjax.evaluation.coverage import Coverage
 from rsjax.evaluation.depth_estimator import DepthEstimator, estimate_depth
 from rsjax.evaluation.generation import OWN, Generation, teacher_forced, with_baselines
 from rsjax.evaluation.localiser import Localiser, recorded_places, train_localiser
@@ -35,6 +37,7 @@ from rsjax.evaluation.probes import Probes, probe, with_probes
 from rsjax.evaluation.protocols import Protocol, check, of_run
 from rsjax.evaluation.registry import (
     NO_PROBES,
+    Familiarity,
     Located,
     Metric,
     PerClip,
@@ -114,6 +117,8 @@ class EvaluationClips:
             )
         protocol = check(protocol, frames, size, where)
         clips = Clips.stacked(records, numbers).first(protocol.prompt_frames + protocol.horizon)
+        if not knows_success(store):
+            clips.state[..., STATE.index("success")] = np.nan
         return cls(store, split, protocol, records, clips)
 
     def ids(self) -> list[dict[str, Any]]:
@@ -133,6 +138,7 @@ def evaluate(
     folder: Path | None = None,
     estimator: DepthEstimator | None = None,
     probes: Probes | Unavailable = NO_PROBES,
+    coverage: Coverage | None = None,
 ) -> Evaluation:
     """Scores a model and two baselines on held-out clips: the last prompt frame repeated, and the reconstruction.
 
@@ -143,6 +149,7 @@ def evaluate(
         folder: where generated batches are kept until the evaluation is finished; None: in memory.
         estimator: estimates depth from frames; None: no scores of estimated depth.
         probes: episodes of the clips' simulator that test contacts and free driving, or why there are none.
+        coverage: the bank of training clips; None: distances from them are not scored.
 
     Raises:
         StoreError: a test clip is damaged.
@@ -164,7 +171,11 @@ def evaluate(
         probed = probes
     elif localiser is not None:
         probed = probe(generation.trained, localiser, probes, protocol, folder)
-    predicted_tokens = teacher_forced(generation.trained, protocol, clips)
+    predicted_tokens = teacher_forced(generation.trained, protocol.prompt_frames, clips.video, clips.actions)
+    familiarity = None
+    if coverage is not None and predicted_tokens is not None and predicted_tokens.features is not None:
+        distances = coverage.distances(predicted_tokens.features, clips.actions[:, protocol.prompt_frames :])
+        familiarity = Familiarity(*coverage.of_clips(distances.mean(1)))
     repetitions: list[Scored] = []
     curves: list[Curves] = []
     for run in range(protocol.repetitions):
@@ -177,6 +188,7 @@ def evaluate(
             locate,
             predicted_tokens,
             eval_clips.retakes,
+            familiarity,
         )
         scenes = with_probes(scenes, probed)
         scored = score_all(scenes, protocol, trained.config.model.takes_actions)
@@ -253,6 +265,7 @@ def make_scenes(
     locate: Locate | None,
     predicted_tokens: TeacherForced | None = None,
     retakes: Video | None = None,
+    familiarity: Familiarity | None = None,
 ) -> dict[str, Scene]:
     """Returns the scenes by the suffix that names their scores: "" for the prediction, and one for each baseline.
 
@@ -260,6 +273,7 @@ def make_scenes(
         videos: by kind of actions, one for each draw; the first under the clips' own actions is the prediction.
         predicted_tokens: how well the model predicts tokens from true frames.
         retakes: second recordings of the clips' scenes.
+        familiarity: how far the clips are from the training clips.
     """
     shown = with_baselines(trained, clips, videos[OWN][0], protocol.prompt_frames)
     truth = scored_frames(trained, protocol, clips, shown.get("_tokenizer"))
@@ -286,7 +300,9 @@ def make_scenes(
     alternatives = {
         kind: [scaled(video, protocol.resolution) for video in draws] for kind, draws in videos.items() if kind != OWN
     }
-    scenes[""] = replace(scenes[""], alternatives=alternatives, teacher_forced=predicted_tokens)
+    scenes[""] = replace(
+        scenes[""], alternatives=alternatives, teacher_forced=predicted_tokens, familiarity=familiarity
+    )
     return scenes
 
 
@@ -307,7 +323,7 @@ def scored_frames(
                 f"protocol {protocol.name} compares with the tokenizer's reconstruction, and a model of family "
                 f"{trained.config.model.family!r} has no tokenizer; choose another protocol"
             )
-        truth = Video(reconstruction.rgb, truth.depth)
+        truth = replace(truth, rgb=reconstruction.rgb)
     return scaled(truth, protocol.resolution)
 
 
@@ -352,10 +368,11 @@ def scaled(video: Video, side: int) -> Video:
         return video
     lead = video.rgb.shape[:2]
     rgb = [cv2.resize(frame, (side, side), interpolation=cv2.INTER_AREA) for frame in np.concatenate(video.rgb)]
+    small = replace(video, rgb=np.stack(rgb).reshape(*lead, side, side, 3))
     if video.depth is None:
-        return Video(np.stack(rgb).reshape(*lead, side, side, 3))
+        return small
     depth = [cv2.resize(frame, (side, side), interpolation=cv2.INTER_NEAREST) for frame in np.concatenate(video.depth)]
-    return Video(np.stack(rgb).reshape(*lead, side, side, 3), np.stack(depth).reshape(*lead, side, side))
+    return replace(small, depth=np.stack(depth).reshape(*lead, side, side))
 
 
 # The scores of all metrics: over clips, over repetitions, and for the best of several samples.

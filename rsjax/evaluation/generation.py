@@ -4,9 +4,10 @@ Axes: B clips, T frames, H×W pixels, A action dimensions, R draws of actions.
 """
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from functools import cached_property, partial
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -129,7 +130,7 @@ class Generation:
 
     def _video(self, batch: Batch) -> Video:
         record = self._record(batch)
-        return Video(record["rgb"], record["depth"])
+        return Video(record["rgb"], record["depth"], state=record.get("state"))
 
     def _read(self, batch: Batch) -> Record | None:
         if self.folder is None:
@@ -160,7 +161,7 @@ class Generation:
         )
         inputs = (self._truth[padded], own[padded], actions[padded])
         video = rolled_out(generate, self.protocol, *inputs)[: len(rows)]
-        return self.score(rows, video) if sampled else {"rgb": video.rgb, "depth": video.depth}
+        return self.score(rows, video) if sampled else {"rgb": video.rgb, "depth": video.depth, "state": video.state}
 
 
 def batch_size(trained: TrainedModel) -> int:
@@ -169,29 +170,30 @@ def batch_size(trained: TrainedModel) -> int:
     return -(-trained.config.eval.batch_size // devices) * devices
 
 
-def teacher_forced(trained: TrainedModel, protocol: Protocol, clips: Clips) -> TeacherForced | None:
+def teacher_forced(
+    trained: TrainedModel, prompt_frames: int, video: Video, actions: Float[np.ndarray, "B T A"]
+) -> TeacherForced | None:
     """Predicts every frame's tokens from the true frames before it; returns None if the model cannot do this.
 
     This costs less than one of the several rollouts of each clip, so the result is neither kept nor divided among
     processes.
     """
-    size = batch_size(trained)
-    video = clips.video
     parts = list[TeacherForced]()
-    count = len(clips.rgb)
+    count = len(video)
+    devices = jax.local_device_count()
+    size = min(batch_size(trained), -(-count // devices) * devices)
     for start in range(0, count, size):
         rows = np.minimum(np.arange(start, start + size), count - 1)  # the last batch is padded to full size
-        inputs = (trained.params, trained.assets, video[rows], clips.actions[rows])
-        part = trained.model.teacher_forced(*inputs, protocol.prompt_frames)
+        inputs = (trained.params, trained.assets, video[rows], actions[rows])
+        part = trained.model.teacher_forced(*inputs, prompt_frames)
         if part is None:
             return None
         parts.append(part)
 
-    def joined(name: str) -> dict[str, np.ndarray]:
-        fields = [getattr(part, name) for part in parts]
-        return {branch: np.concatenate([field[branch] for field in fields])[:count] for branch in fields[0]}
+    def joined(name: str) -> Any:
+        return jax.tree.map(lambda *x: np.concatenate(x)[:count], *[getattr(part, name) for part in parts])
 
-    return TeacherForced(joined("cross_entropy"), joined("accuracy"))
+    return TeacherForced(**{field.name: joined(field.name) for field in fields(TeacherForced)})
 
 
 def rolled_out(
@@ -244,7 +246,9 @@ def _repeat_first(video: Video, prompt_frames: int) -> Video:
 def _joined(parts: list[Video], axis: int = 0) -> Video:
     """Joins videos of several batches, or parts of one video; a part without depth gets NaN if another has depth."""
     rgb = np.concatenate([part.rgb for part in parts], axis)
+    states = [part.state for part in parts if part.state is not None]
+    joined = Video(rgb, state=np.concatenate(states, axis) if states else None)
     if all(part.depth is None for part in parts):
-        return Video(rgb)
+        return joined
     unknown = [np.full(part.rgb.shape[:-1], np.nan, np.float32) if part.depth is None else part.depth for part in parts]
-    return Video(rgb, np.concatenate(unknown, axis))
+    return replace(joined, depth=np.concatenate(unknown, axis))

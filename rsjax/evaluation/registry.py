@@ -131,6 +131,19 @@ class Probed:
 NO_PROBES = Unavailable("no grasps and drives were simulated for this evaluation")
 
 
+@dataclass(frozen=True)
+class Familiarity:
+    """How far B clips' states and actions are from the training clips (:mod:`rsjax.evaluation.coverage`).
+
+    Attributes:
+        coverage: the distance, where 1 is that of the median training clip from the others.
+        percentile: the share of training clips that are nearer to the others, 0 to 1.
+    """
+
+    coverage: Float[np.ndarray, " B"]
+    percentile: Float[np.ndarray, " B"]
+
+
 @dataclass(frozen=True, eq=False)
 class Scene:
     """Inputs of a metric: B clips, of which the first ``prompt_frames`` frames are the prompt.
@@ -142,6 +155,7 @@ class Scene:
         estimated: depth estimated from the frames; None without an estimator.
         located: where cube and gripper are in the last frame; None if the clips do not record it.
         teacher_forced: how well the model predicts each frame's tokens; None for a baseline or a model without tokens.
+        familiarity: how far the recorded clips are from the training clips; None: not measured, or a baseline.
         second_take: the same scenes recorded once more (same start, same task), for Physics-IQ's score.
         probed: grasps at set offsets and free drives, or why there are none.
         settings: the settings of the evaluation, with the paths of weights.
@@ -155,6 +169,7 @@ class Scene:
     estimated: EstimatedDepth | None = None
     located: Located | None = None
     teacher_forced: TeacherForced | None = None
+    familiarity: Familiarity | None = None
     second_take: Video | None = None
     probed: Probed | Unavailable = NO_PROBES
     settings: EvalConfig = field(default_factory=EvalConfig)

@@ -15,6 +15,7 @@ from rsjax.config import Config, EvalConfig, content_key, to_dict
 from rsjax.data.clips import frame_rate
 from rsjax.data.store import Store, open_store
 from rsjax.evaluation import evaluate as evaluation
+from rsjax.evaluation.coverage import make_coverage
 from rsjax.evaluation.evaluate import EvaluationClips
 from rsjax.evaluation.metrics.physics_iq import THRESHOLD
 from rsjax.evaluation.protocols import Protocol, find, label, of_run
@@ -162,10 +163,9 @@ def _evaluate(
             if old != parts:  # from an evaluation with other settings that never finished
                 shutil.rmtree(old, ignore_errors=True)
         estimator = depth_estimator(run)
+        bank = make_coverage(trained, store, run.directory)
         simulated = probes_of(run, store, eval_clips)
-        found = evaluation.evaluate(
-            trained, store, eval_clips=eval_clips, folder=parts, estimator=estimator, probes=simulated
-        )
+        found = evaluation.evaluate(trained, store, None, eval_clips, parts, estimator, simulated, bank)
         about = {"label": name, "key": key, "code": code_version(Path(rsjax.__file__).resolve().parents[1])}
         about |= _described(trained, run, store, eval_clips)
         write_result(folder, result_of(found, **about), found.kept)

@@ -117,8 +117,9 @@ async def _step(viewer: Viewer, message: Message) -> Message:
         unsure = viewer.mean_bits(node)
     else:
         unsure = None
+    known = {"uncertainty": unsure, "coverage": viewer.coverage(node)}
     milliseconds = round(1000 * (time.monotonic() - began), 2)
-    return {"type": "stepped"} | facts | {"clipped": clipped, "ms": milliseconds, "uncertainty": unsure}
+    return {"type": "stepped"} | facts | {"clipped": clipped, "ms": milliseconds} | known
 
 
 @answers("fork")

@@ -18,6 +18,7 @@ from rsjax.data.codec import Record
 from rsjax.data.store import Source, Store, StoreError
 from rsjax.devices import on_cpu
 from rsjax.errors import UserError, first_line
+from rsjax.evaluation.coverage import Coverage, read_coverage
 from rsjax.files import FileError, read_json
 from rsjax.models.trained import TrainedModel
 from rsjax.tools.play.controls import Controls, controls_of_run
@@ -147,6 +148,13 @@ class PlayRun:
             scores = read_json(self.data.run / "metrics.json")
             return {name: scores[name] for name in MEASURED if isinstance(scores.get(name), float)}
         return {}
+
+    def coverage(self) -> Coverage | None:
+        """The bank that says how far frames are from the training clips; None if the run has not made it."""
+        try:
+            return read_coverage(self.trained, self.data.clips, self.data.run)
+        except UserError:
+            return None
 
     @cached_property
     def fingerprint(self) -> str:

@@ -233,6 +233,17 @@ class Viewer:
             return None
         return round(float(node.state.entropy.mean() / np.log(2)), 4)
 
+    def coverage(self, node: Node) -> float | None:
+        """Returns the share of the training clips' frames that are nearer to the others than a frame is to them.
+
+        None for a first frame, for a family without features, and for a run without a bank of training clips.
+        """
+        bank = self.session.run.coverage
+        if bank is None or node.state.features is None or node.action is None:
+            return None
+        _, percentile = bank.of_frames(bank.distances(node.state.features, node.action))
+        return round(float(percentile), 4)
+
     def _later(self, work: Any) -> None:
         task = asyncio.get_running_loop().create_task(work)
         self._tasks.add(task)

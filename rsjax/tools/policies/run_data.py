@@ -10,6 +10,7 @@ from rsjax.config import Config, SimConfig, content_key, from_dict
 from rsjax.data.clips import readable
 from rsjax.data.store import Store, open_store
 from rsjax.errors import UserError
+from rsjax.evaluation.coverage import make_coverage
 from rsjax.models.load_run import load, load_config
 from rsjax.models.trained import TrainedModel
 from rsjax.tools.pipeline.provenance import training_settings
@@ -17,6 +18,8 @@ from rsjax.tools.pipeline.run import Run
 from rsjax.tools.pipeline.run_clips import relocated
 from rsjax.tools.policies.config import PolicyConfig, policy_preset
 from rsjax.tools.policies.demos import Demos, Only, load_demos
+from rsjax.tools.policies.judges.head_judge import NAME as HEAD
+from rsjax.tools.policies.judges.head_judge import HeadJudge, head_judge
 from rsjax.tools.policies.judges.judge import Judge
 from rsjax.tools.policies.judges.judge_training import FOLDER
 from rsjax.tools.policies.judges.trained_judge import load_judge
@@ -71,14 +74,30 @@ class RunData:
             )
         return from_dict(SimConfig, self.clips.manifest["config"])
 
-    def world(self, count: int, judge: Path | None = None) -> ModelWorld:
-        """Returns the run's world model as a world of ``count`` episodes, with the run's judge or that in a folder.
+    def world(self, count: int, judge: Path | None = None, measured: bool = False) -> ModelWorld:
+        """Returns the run's world model as a world of ``count`` episodes, with a judge as of :meth:`world_judge`.
+
+        Args:
+            measured: whether to measure how far episodes are from the training clips.
 
         Raises:
             UserError: the run is unfinished, its model takes no actions, or there is no judge for its frames.
         """
         check_takes_actions(self.config.model, f"{self.run}: the model")
-        return ModelWorld(self.trained, count, self.judge(judge))
+        coverage = None
+        if measured:
+            coverage = make_coverage(self.trained, self.clips, self.run)
+        return ModelWorld(self.trained, count, self.world_judge(judge), coverage=coverage)
+
+    def world_judge(self, folder: Path | None = None) -> Judge | HeadJudge:
+        """Returns the run's judge, that in another folder, or for the path "head" that of the model's own heads.
+
+        Raises:
+            UserError: there is no judge, its frames differ in size from the run's, or the model has no state heads.
+        """
+        if folder == Path(HEAD):
+            return head_judge(self.trained, self.run)
+        return self.judge(folder)
 
     def check_world(self, like: "RunData") -> None:
         """Checks, without loading weights, that policies of another run's clips can act in this run's model.

@@ -3,6 +3,7 @@ import { at, attempt, state, tree } from "./state.js";
 
 const BLOCK = 32; // frames asked for at once
 const APART = 100; // milliseconds between two drawings of the list and the chart
+const UNSEEN = 0.99; // of the training frames are nearer to the others: the model has not seen this
 const MOST_TRIES = 5; // to get a frame's pictures again
 const asked = new Set();
 const pending = []; // frames to be drawn whose time is measured: [frame, time of the key or null]
@@ -137,13 +138,23 @@ export function meter() {
   const { rate, p50, p95, count } = state.pace.figures();
   const milliseconds = (value) => (value === undefined ? "–" : `${Math.round(value)} ms`);
   const { server, bits } = state.parts;
+  const share = tree.coverageAt(state.current, state.frame);
   const values = {
     rate: rate ? rate.toFixed(1) : "–",
     key: `${milliseconds(p50)}, 95 % within ${milliseconds(p95)}`,
     server: milliseconds(server),
+    coverage: familiar(share),
     bits: state.shows.uncertainty && bits !== undefined ? `${bits.toFixed(2)} bits a cell` : "–",
   };
   at("meter").dataset.keys = count;
   for (const each of at("meter").querySelectorAll("dd")) each.textContent = values[each.dataset.value];
   at("bits").hidden = !state.shows.uncertainty;
+  at("coverage").hidden = share === undefined;
+  at("coverage").classList.toggle("alarm", share > UNSEEN);
+}
+
+/** Says how far a frame is from what the model was trained on. */
+function familiar(share) {
+  if (share === undefined) return "–";
+  return share > UNSEEN ? "the model has not seen this" : `farther than ${Math.round(100 * share)} % of it`;
 }

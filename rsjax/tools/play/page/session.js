@@ -104,6 +104,7 @@ export function send() {
     (message) => {
       parts.server = message.ms;
       if (message.uncertainty !== null) parts.bits = message.uncertainty;
+      tree.putCoverage(message);
     },
     () => {}, // the pace has it too
   );

@@ -5,10 +5,11 @@ export function makeTree() {
   const branches = new Map();
   const frames = new Map(); // "branch kind frame" → {data, width, height, scale}
   const scores = new Map(); // branch → array of PSNR by frame
+  const coverage = new Map(); // "branch frame" → share of the training frames that are nearer to the others
   const points = new Map(); // "branch pane frame" → [[x, y, visible], …]
 
   function clear() {
-    for (const each of [branches, frames, scores, points]) each.clear();
+    for (const each of [branches, frames, scores, coverage, points]) each.clear();
   }
 
   function setBranch({ branch, parent, fork, length, draw }) {
@@ -46,6 +47,15 @@ export function makeTree() {
     return Array.from({ length: length(branch) }, (_, number) => score(branch, number)?.psnr ?? undefined);
   }
 
+  function putCoverage({ branch, frame: number, coverage: share }) {
+    if (share !== null) coverage.set(`${branch} ${number}`, share);
+  }
+
+  /** Returns the share of the training frames that are nearer to the others than this one is; undefined if unknown. */
+  function coverageAt(branch, number) {
+    return coverage.get(`${owner(branch, number)} ${number}`) ?? coverage.get(`${branch} ${number}`);
+  }
+
   function putPoints({ branch, pane, frame: number, points: each }) {
     points.set(`${branch} ${pane} ${number}`, each);
   }
@@ -67,8 +77,8 @@ export function makeTree() {
   function remove(branch) {
     branches.delete(branch);
     scores.delete(branch);
-    for (const map of [frames, points]) for (const key of map.keys()) if (key.startsWith(`${branch} `)) map.delete(key);
+    for (const map of [frames, coverage, points]) for (const key of map.keys()) if (key.startsWith(`${branch} `)) map.delete(key);
   }
 
-  return { branches, owner, clear, setBranch, putFrame, frame, putScore, score, psnr, putPoints, pointsAt, length, ordered, remove };
+  return { branches, owner, clear, setBranch, putFrame, frame, putScore, score, psnr, putCoverage, coverageAt, putPoints, pointsAt, length, ordered, remove };
 }

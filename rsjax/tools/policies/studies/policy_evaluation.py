@@ -1,6 +1,6 @@
 """Judges policies in world models: does success there follow success in the true simulator (Fig. 5)?"""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from rsjax.errors import UserError
+from rsjax.evaluation.coverage import UNSEEN
 from rsjax.evaluation.prediction_powered import corrected_rate
 from rsjax.evaluation.statistics import Estimate, wilson
 from rsjax.files import write_file, write_json
@@ -45,6 +46,11 @@ FORMULAS = (
 CORRECTED = (
     "Corrected: the rate in the world model, corrected by the trials that are paired with true ones. Trials saved: how "
     "many more trials in the simulator alone would give an interval as narrow (docs/policy_learning.md)."
+)
+COVERAGE_HEAD = ("run", "not seen in training", "95 %", "same outcome where seen", "where not seen")
+COVERAGE = (
+    "Not seen in training: imagined episodes that are farther from the training clips than 99 % of these are from one "
+    "another (docs/coverage.md)."
 )
 TRAININGS = (
     "Over trainings: r is the mean over the runs that differ in their seeds alone. Its interval is for other trainings "
@@ -186,6 +192,7 @@ def compared(
             "world_model": made.success,
             "corrected": asdict(corrected_rate(real, paired, made.success[len(real) :])),
             "uninterpretable": made.uninterpretable,
+            "unfamiliarity": made.unfamiliarity,
             "clipped": {"simulator": true[name].clipped, "world_model": made.clipped},
         }
     spoilt = np.mean([each["uninterpretable"] for each in policies.values()])
@@ -198,8 +205,34 @@ def compared(
         "policies": policies,
         "same_outcome": float(np.mean(same)),
         "uninterpretable": float(spoilt),
+        "coverage": covered(policies.values()),
         **found,
     }
+
+
+def covered(policies: Iterable[Mapping[str, Any]]) -> dict[str, Any] | None:
+    """Returns how many imagined episodes the model has not seen the like of, and how the outcome agrees in the others.
+
+    None if the distances from the training clips were not measured.
+
+    Args:
+        policies: their entries in ``results.json``.
+
+    Returns:
+        ``episodes``, and ``unseen``, how many of them are farther from the training clips than ``UNSEEN`` of these are
+        from one another. Of the episodes that were run in the simulator too, ``same_outcome`` has the number with the
+        same outcome and their number, among those ``seen`` and those ``unseen``.
+    """
+    policies = list(policies)
+    if not policies or not all(each["unfamiliarity"] for each in policies):
+        return None
+    unseen = [np.array(each["unfamiliarity"]) > UNSEEN for each in policies]
+    same = [np.equal(each["simulator"], each["world_model"][: len(each["simulator"])]) for each in policies]
+    paired = np.concatenate([far[: len(agree)] for far, agree in zip(unseen, same, strict=True)])
+    agree = np.concatenate(same)
+    counts = {name: [int(agree[of].sum()), int(of.sum())] for name, of in (("seen", ~paired), ("unseen", paired))}
+    every = np.concatenate(unseen)
+    return {"episodes": len(every), "unseen": int(every.sum()), "same_outcome": counts}
 
 
 def trainings(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -321,6 +354,15 @@ def table(results: Mapping[str, Any]) -> str:
         "",
         CORRECTED,
     ]
+    far = []
+    for row in rows:
+        if row["coverage"] is not None:
+            counts = [row["coverage"]["same_outcome"][name] for name in ("seen", "unseen")]
+            shares = [ABSENT if not total else percent(wilson(agree, total)) for agree, total in counts]
+            share = wilson(row["coverage"]["unseen"], row["coverage"]["episodes"])
+            far.append([row["run"], percent(share), interval_text(share), *shares])
+    if far:
+        lines += ["", as_markdown(Table(COVERAGE_HEAD, far)), "", COVERAGE]
     for number, row in enumerate(rows):
         if row["judge"] not in [before["judge"] for before in rows[:number]]:
             lines += markdown(row["judge"])

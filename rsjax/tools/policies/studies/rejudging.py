@@ -85,6 +85,7 @@ def rejudge(out: Path, judge: Judge, name: str) -> Path:
                 (found == SUCCESS).tolist(),
                 row["policies"][policy]["clipped"]["world_model"],
                 (found == UNINTERPRETABLE).tolist(),
+                row["policies"][policy].get("unfamiliarity", []),
             )
             for policy, found in labels.items()
         }

@@ -63,11 +63,14 @@ class Result:
         success: by episode.
         clipped: how many numbers of actions were clipped.
         uninterpretable: by episode, whether the judge cannot interpret its last frame; False in the simulator.
+        unfamiliarity: by episode, how far it is from the world model's training clips, as a percentile, 0 to 1; empty
+            if that is not measured.
     """
 
     success: list[bool] = field(default_factory=list)
     clipped: int = 0
     uninterpretable: list[bool] = field(default_factory=list)
+    unfamiliarity: list[float] = field(default_factory=list)
 
     @property
     def share(self) -> Estimate:
@@ -100,12 +103,14 @@ def try_policy(
     with make_once(folder, key, refuse=OTHERS) as work:
         success = work.metadata.setdefault("success", [])
         uninterpretable = work.metadata.setdefault("uninterpretable", [])
+        unfamiliarity = work.metadata.setdefault("unfamiliarity", [])
         clipped = work.metadata.get("clipped", 0)
         with Progress(f"{name}: trials", len(starts), "episodes", len(success)) as progress:
             # An episode's draws depend on its group, so a resumed series continues at a multiple of ``together``.
             for first in range(len(success), len(starts), world.count):
                 group = starts[first : first + world.count]
                 episodes = run_episodes(world, policy.actor(first), group, trials.max_steps)
+                unfamiliarity += world.unfamiliarity(episodes, trials.max_steps + 1)
                 for number, episode in enumerate(episodes, first):
                     success.append(bool(episode.success.any()))
                     uninterpretable.append(episode.uninterpretable)
@@ -114,9 +119,13 @@ def try_policy(
                         write_mp4(folder / f"episode-{number:02d}.mp4", episode.rgb, FPS, 4)
                     if number < save_frames:
                         save_arrays(folder / f"episode-{number:02d}.npz", rgb=episode.rgb)
-                work.save(success=success, uninterpretable=uninterpretable, clipped=clipped)
+                work.save(
+                    success=success, uninterpretable=uninterpretable, clipped=clipped, unfamiliarity=unfamiliarity
+                )
                 progress.update(len(success), success=sum(success))
-    return Result(success, clipped, uninterpretable)
+    if len(unfamiliarity) < len(success):  # episodes that an older version or another command has run
+        unfamiliarity = []
+    return Result(success, clipped, uninterpretable, unfamiliarity)
 
 
 def open_lift(config: SimConfig, trials: Trials) -> AbstractContextManager[SimulatorWorld]:

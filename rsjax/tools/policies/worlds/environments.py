@@ -15,9 +15,12 @@ from gymnasium.vector.utils import batch_space
 from jaxtyping import UInt8
 
 from rsjax.config import SimConfig
+from rsjax.data.state_labels import STATE
 from rsjax.errors import UserError
 from rsjax.models.load_run import load
 from rsjax.models.trained import TrainedModel
+from rsjax.tools.policies.judges.head_judge import NAME as HEAD
+from rsjax.tools.policies.judges.head_judge import HeadJudge, head_judge
 from rsjax.tools.policies.judges.judge import LABELS, Judge
 from rsjax.tools.policies.judges.judge_training import judge_of
 from rsjax.tools.policies.worlds.actions import OutOfRange, check_out_of_range, check_takes_actions
@@ -41,8 +44,9 @@ class EnvironmentSettings:
         store: the new path of the run's store of ingested clips, if it was moved.
         split: the clips whose first frames episodes begin with.
         max_steps: steps after which an episode is truncated; it may be longer than the model's window.
-        judge: decides reward and termination: a judge, the directory of a trained one, or "run" for the judge that
-            ``experiments.judge`` trained for the run, if any. Without a judge, every reward is 0.
+        judge: decides reward and termination: a judge, the directory of a trained one, "run" for the judge that
+            ``experiments.judge`` trained for the run, if any, or "head" for the model's own success head. Without a
+            judge, every reward is 0.
         out_of_range: whether actions outside the action space are clipped and counted ("clip"), or raise ("refuse").
     """
 
@@ -80,7 +84,11 @@ class _Model:
             store = Path(settings.store)
         else:
             store = None
-        judge = judge_of(run, settings.judge, size)
+        judge: Judge | HeadJudge | None
+        if settings.judge == HEAD:
+            judge = head_judge(trained, folder)
+        else:
+            judge = judge_of(run, settings.judge, size)
         self.world = ModelWorld(trained, count, judge, whole_videos=False)
         self.starts = Starts(config, folder, Path(settings.data_dir), store, settings.split, has_depth)
         self.action_space = spaces.Box(self.world.actions.low, self.world.actions.high)
@@ -91,19 +99,25 @@ class _Model:
 
 
 def _info(state: WorldState, clipped: np.ndarray, clip: np.ndarray) -> dict[str, np.ndarray]:
-    """Returns the ``info`` of episodes in a world model: success, the judge's label and verdict, and the counts."""
+    """Returns the ``info`` of episodes in a world model: success, the judge's label and verdict, and the counts.
+
+    With state heads it has the object's height and the gripper's opening too, in metres.
+    """
     labels = ["unjudged"] * len(state.success)
     verdict = np.zeros((len(labels), len(LABELS)))
     if state.verdict is not None:
         labels = [LABELS[number] for number in state.verdict.argmax(-1)]
         verdict = state.verdict
-    return {
+    info = {
         "success": state.success,
         "label": np.array(labels, object),
         "verdict": verdict,
         "clipped": clipped.copy(),
         "clip": clip.copy(),
     }
+    if state.read is not None:
+        info |= {name: state.read[:, STATE.index(name)] for name in ("height", "opening")}
+    return info
 
 
 class WorldModelEnv(gymnasium.Env[Any, Any]):

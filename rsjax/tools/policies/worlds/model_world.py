@@ -13,12 +13,14 @@ from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from rsjax.clip import Video
 from rsjax.config import content_key
+from rsjax.evaluation.coverage import Coverage, clip_distances
 from rsjax.evaluation.results import fingerprint
 from rsjax.models.base import Imagination, WorldModel
 from rsjax.models.trained import TrainedModel
-from rsjax.tools.policies.judges.judge import HISTORY, SUCCESS, Judge, judge_key
+from rsjax.tools.policies.judges.head_judge import HeadJudge
+from rsjax.tools.policies.judges.judge import SUCCESS, Judge, frames_of, judge_key
 from rsjax.tools.policies.worlds.actions import ActionRange, action_range
-from rsjax.tools.policies.worlds.world import WorldState
+from rsjax.tools.policies.worlds.world import Episode, WorldState
 
 DRAWS = 2**20  # added to a clip's index at each step, so that steps differ in their draws; clip indices are smaller
 
@@ -46,9 +48,11 @@ class ModelWorld:
     Args:
         trained: a model that ``rsjax.load`` loaded.
         count: episodes that run together.
-        judge: decides which frames show success; without a judge none do.
+        judge: decides which frames show success, from the frames or from what the model's own head reads; without a
+            judge none do.
         actions: the actions that it takes; by default those of its run.
         whole_videos: whether a family that generates only whole videos may serve, one short video for each frame.
+        coverage: the bank of training clips from which the distance of episodes is measured; None: it is not.
 
     Raises:
         UserError: the family cannot generate frame by frame, and ``whole_videos`` is False.
@@ -58,15 +62,18 @@ class ModelWorld:
         self,
         trained: TrainedModel,
         count: int,
-        judge: Judge | None,
+        judge: Judge | HeadJudge | None,
         actions: ActionRange | None = None,
         whole_videos: bool = True,
+        coverage: Coverage | None = None,
     ) -> None:
         self.count = count
         self.actions = actions or action_range(trained.config, trained.assets.normalization)
         self.validation: dict[str, Any] | None = getattr(judge, "validation", None)
         self._trained = trained
         self._judge = judge
+        self._history = frames_of(judge)
+        self._coverage = coverage
         self._imagination: Imagination
         if whole_videos and type(trained.model).imagine is WorldModel.imagine:
             self._imagination = WholeVideoImagination(trained)
@@ -91,13 +98,19 @@ class ModelWorld:
             np.stack(depth)[:, None] if len(depth) == len(starts) else None,
         )
         video = self._imagination.restart(which, first, np.array([start.draw for start in starts]))
-        recent = np.repeat(np.asarray(video.rgb), HISTORY, axis=1)
+        recent = np.repeat(np.asarray(video.rgb), self._history, axis=1)
+        read = None
+        if video.state is not None:
+            read = np.repeat(video.state, self._history, axis=1)
         observation = _last_frame(video)
         if everything:
             self._recent = recent
+            self._read = read
             self._observation = observation
         else:
             self._recent[which] = recent
+            if self._read is not None:
+                self._read[which] = read
             for name, frames in observation.items():
                 merged = self._observation[name].copy()  # jax's own arrays cannot be written
                 merged[which] = frames
@@ -111,18 +124,44 @@ class ModelWorld:
         clipped = np.concatenate([outside.sum(1), np.zeros(spare, int)])
         video = self._imagination.step(rows)
         self._recent = np.concatenate([self._recent[:, 1:], video.rgb], axis=1)
+        if self._read is not None and video.state is not None:
+            self._read = np.concatenate([self._read[:, 1:], video.state], axis=1)
         self._observation = _last_frame(video)
         return self._state(rows, clipped)
+
+    def unfamiliarity(self, episodes: Sequence[Episode], frames: int) -> list[float]:
+        if self._coverage is None:
+            return []
+        rgb = []
+        depth = []
+        actions = np.zeros((len(episodes), frames, len(self.actions.low)), np.float32)
+        for number, episode in enumerate(episodes):
+            rows = np.minimum(np.arange(frames), len(episode.rgb) - 1)  # the last frame goes on
+            rgb.append(episode.rgb[rows])
+            if episode.depth is not None:
+                depth.append(episode.depth[rows])
+            actions[number, : len(episode.rgb)] = episode.actions
+        video = Video(np.stack(rgb), np.stack(depth) if depth else None)
+        lengths = [len(episode.rgb) for episode in episodes]
+        distances = clip_distances(self._trained, self._coverage, video, actions, lengths)
+        return self._coverage.of_clips(distances)[1].tolist()
 
     def _state(self, actions: Float32[np.ndarray, "B A"], clipped: Int[np.ndarray, " B"]) -> WorldState:
         running = slice(self._running)
         success = np.zeros(self._running, bool)
         verdict = None
-        if self._judge is not None:
+        read = None
+        if self._read is not None:
+            read = self._read[running, -1]
+        if isinstance(self._judge, HeadJudge):
+            assert self._read is not None
+            verdict = self._judge.read(self._read)[running]
+        elif self._judge is not None:
             verdict = self._judge(self._recent)[running]
+        if verdict is not None:
             success = verdict.argmax(-1) == SUCCESS
         observation = {name: frames[running] for name, frames in self._observation.items()}
-        return WorldState(observation, success, actions[running], clipped[running], verdict)
+        return WorldState(observation, success, actions[running], clipped[running], verdict, read)
 
 
 def _last_frame(video: Video) -> dict[str, np.ndarray]:

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 from rsjax.config import SimConfig, content_key, require
 from rsjax.progress import note
 from rsjax.tools.policies.worlds.actions import LIFT_UNIT, ActionRange
-from rsjax.tools.policies.worlds.world import WorldState
+from rsjax.tools.policies.worlds.world import Episode, WorldState
 from rsjax.tools.sim.episode import Simulator
 from rsjax.tools.sim.expert import State
 from rsjax.tools.sim.lift import LiftSim
@@ -126,6 +126,9 @@ class SimulatorWorld:
             else:
                 self._look(number)
         return self._state(controls, clipped)
+
+    def unfamiliarity(self, episodes: Sequence[Episode], frames: int) -> list[float]:
+        return []
 
     def _look(self, number: int) -> None:
         self._views[number] = self.simulators[number].render()

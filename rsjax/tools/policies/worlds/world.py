@@ -28,6 +28,8 @@ class WorldState:
         actions: the actions that led here, after clipping; zeros after a reset.
         clipped: how many numbers of these actions were clipped.
         verdict: the judge's probability of each label; None without a judge.
+        read: what the model's state heads read from the current frames (:data:`rsjax.data.state_labels.STATE`); None in
+            the simulator and for a model without them.
     """
 
     observation: Observation
@@ -35,6 +37,7 @@ class WorldState:
     actions: Float32[np.ndarray, "B A"]
     clipped: Int[np.ndarray, " B"]
     verdict: Float[np.ndarray, "B 3"] | None = None
+    read: Float[np.ndarray, "B 3"] | None = None
 
 
 class World(Protocol):
@@ -77,6 +80,16 @@ class World(Protocol):
 
         Raises:
             ActionError: the actions have the wrong shape, or a value that is not finite.
+        """
+        ...
+
+    def unfamiliarity(self, episodes: Sequence["Episode"], frames: int) -> list[float]:
+        """Returns how far episodes in a world model are from its training clips, as percentiles, 0 to 1.
+
+        Empty in the simulator, and for a model whose distances are not measured.
+
+        Args:
+            frames: of the longest episode that may be; programs are compiled for this number.
         """
         ...
 

@@ -6,10 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import jinja2
+import numpy as np
 from markupsafe import Markup
 
+from rsjax.evaluation.coverage import UNSEEN
 from rsjax.evaluation.registry import Metric, metrics
 from rsjax.evaluation.results import Curves
+from rsjax.evaluation.statistics import bootstrap
 from rsjax.files import write_file
 from rsjax.progress import duration
 from rsjax.tools.studies.report.curves import curves_svg
@@ -52,6 +55,8 @@ _DEPTH_ROWS = (
     ("_exact_estimator_truth", "the same, of the true frames"),
 )
 _DEPTH_COLUMNS = (("depth_absrel{}", "AbsRel ↓", 4), ("depth_delta1{}", "δ₁ ↑", 3), ("depth_delta2{}", "δ₂ ↑", 3))
+_COVERAGE_GROUPS = 4  # groups of clips by their distance from the training clips
+_STATE_ROWS = (("", "while the model generates"),)
 _CONTROL_ROWS = (("", "another clip's actions"), ("_uniform", "uniform random actions"))
 _CONTROL_COLUMNS = (("delta_psnr{}_t4", "Δ₄, dB", 2),)
 
@@ -104,11 +109,9 @@ def write_report(path: Path, report: RunReport) -> None:
     contacts = [metrics()[name] for name in _CONTACTS]
     drives = [metrics()[name] for name in _DRIVES]
     scored = [metric for metric in shown if metric.name not in _APART]
-    further = [
-        metric
-        for metric in metrics().values()
-        if not (metric.column or metric.name in _APART or metric.name.startswith("depth_"))
-    ]
+    uncolumned = [metric for metric in metrics().values() if not (metric.column or metric.name in _APART)]
+    further = [metric for metric in uncolumned if not metric.name.startswith(("depth_", "state_", "coverage"))]
+    states = [metric for metric in uncolumned if metric.name.startswith("state_")]
     notes = Footnotes()
     html = environment.get_template("page.html.j2").render(
         report=report,
@@ -119,13 +122,15 @@ def write_report(path: Path, report: RunReport) -> None:
         scores=_table(report, "test clips", notes, _SCORE_ROWS, _columns(scored)),
         depths=_table(report, "depth of the prediction", notes, _DEPTH_ROWS, _DEPTH_COLUMNS),
         further=_table(report, "test clips", notes, _SCORE_ROWS, _columns(further)),
+        coverage=_coverage(report),
+        states=_table(report, "state heads", Footnotes(), _STATE_ROWS, _columns(states)),
         control=_table(report, "ΔPSNR under", notes, _CONTROL_ROWS, _CONTROL_COLUMNS),
         places=_table(report, "last frame", Footnotes(), _PLACE_ROWS, _columns(places)),
         place_errors=Markup(place_errors_svg(report.per_clip, places[: len(_PLACE_ERRORS)])),
         contacts=_table(report, "grasps", Footnotes(), _PLACE_ROWS, _columns(contacts)),
         drives=_table(report, "drives", Footnotes(), _PLACE_ROWS, _columns(drives)),
         probes=Markup(probes_svg(report.curves, drives)),
-        frame_curves=Markup(frame_curves_svg(report.curves, [*scored, *further])),
+        frame_curves=Markup(frame_curves_svg(report.curves, [*scored, *further, *states])),
         notes=notes.texts,
         targets=_targets(report) if report.show_targets else None,
         training={name: Markup(curves_svg(log, name)) for name, log in report.logs.items() if log},
@@ -186,6 +191,24 @@ def _cell(report: RunReport, notes: Footnotes, key: str, suffix: str, digits: in
     if low is None or high is None:
         return Marked(f"{value:.{digits}f}")
     return Marked(f"{value:.{digits}f}", remark=f"{low:.{digits}f} – {high:.{digits}f}")
+
+
+def _coverage(report: RunReport) -> Markup | None:
+    """Returns a table of PSNR by distance from the training clips, in groups of equal size; None without distances."""
+    known = report.per_clip
+    if not {"coverage", "coverage_percentile", "psnr"} <= known.keys():
+        return None
+    far, percentile, psnr = (np.array(known[name]) for name in ("coverage", "coverage_percentile", "psnr"))
+    groups = np.array_split(np.argsort(far, kind="stable"), min(_COVERAGE_GROUPS, len(far)))
+    rows: list[list[CellText]] = []
+    for rows_of in groups:
+        score = bootstrap(psnr[rows_of])
+        remark = "" if score.low is None else f"{score.low:.2f} – {score.high:.2f}"
+        unseen = int((percentile[rows_of] > 100 * UNSEEN).sum())
+        span = f"{far[rows_of].min():.2f} – {far[rows_of].max():.2f}"
+        rows.append([span, str(len(rows_of)), str(unseen), Marked(f"{score.value:.2f}", remark=remark)])
+    header = ("distance, in the median training clip's", "clips", "not seen in training", "PSNR, dB ↑")
+    return as_html(Table(header, rows))
 
 
 def _targets(report: RunReport) -> Markup | None:
