@@ -149,6 +149,7 @@ class PlayRun:
             return {name: scores[name] for name in MEASURED if isinstance(scores.get(name), float)}
         return {}
 
+    @cached_property
     def coverage(self) -> Coverage | None:
         """The bank that says how far frames are from the training clips; None if the run has not made it."""
         try:

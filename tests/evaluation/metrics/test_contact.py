@@ -80,7 +80,7 @@ def test_a_drive_s_errors_are_in_widths_of_its_cube_and_baselines_have_curves() 
     np.testing.assert_allclose(score("drive_psnr", own), expected.mean(1), rtol=1e-5)
     curves = frame_curves({"": own, "_repeat_first": own})
     assert curves["drive_frame"] == list(range(2, FRAMES + 1))
-    np.testing.assert_allclose(curves["drive_psnr"], expected.mean(0), rtol=1e-5)
+    np.testing.assert_allclose(np.array(curves["drive_psnr"], float), expected.mean(0), rtol=1e-5)
     assert curves["drive_psnr_repeat_first"] == curves["drive_psnr"]
     assert len(curves["drive_gripper_error_widths"]) == FRAMES - 1
 

@@ -15,7 +15,7 @@ from rsjax.tools.sim.lift import STEP, LiftSim
 from rsjax.tools.sim.probes import DRIVES, GRASPS, OFFSETS, collect_probes
 from rsjax.tools.sim.unseen import UNITS
 
-CONFIG = SimConfig(episodes=4, test_episodes=2, frames=16, tracks=1, seed=5, workers=1)
+CONFIG = SimConfig(episodes=4, test_episodes=2, frames=16, tracks=1, seed=5)
 RNG = np.random.default_rng(0)
 
 
@@ -93,9 +93,9 @@ def store(sim: LiftSim, tmp_path: Path) -> Store:
 
 
 def test_probes_are_made_once_beside_the_clips_in_their_units(store: Store) -> None:
-    config = SimConfig(episodes=4, test_episodes=2, control_steps=1, image_size=16, workers=1)
+    config = SimConfig(episodes=4, test_episodes=2, control_steps=1, image_size=16)
     counts: list[tuple[int, int]] = []
-    probes = collect_probes(config, store, lambda *done: counts.append(done), grasps=GRASPS[3:4], drives=DRIVES[:1])
+    probes = collect_probes(config, store, lambda *done: counts.append(done), 1, grasps=GRASPS[3:4], drives=DRIVES[:1])
     assert counts[-1] == (2, 2)
     (grasp,) = probes.grasps
     (drive,) = probes.drives
@@ -105,6 +105,6 @@ def test_probes_are_made_once_beside_the_clips_in_their_units(store: Store) -> N
     assert grasp["provenance"]["depth_range"] == [0.0, 1.0]
     assert clip_seed(grasp["provenance"]) != clip_seed({"seed": config.seed, "episode": 0})
     folders = sorted((store.path / "probes").glob("*/manifest.json"))
-    again = collect_probes(config, store, lambda *done: None, grasps=GRASPS[3:4], drives=DRIVES[:1])
+    again = collect_probes(config, store, lambda *done: None, 1, grasps=GRASPS[3:4], drives=DRIVES[:1])
     np.testing.assert_array_equal(again.drives[0]["rgb"], drive["rgb"])
     assert sorted((store.path / "probes").glob("*/manifest.json")) == folders

@@ -147,13 +147,13 @@ def row_of(clip: ComparedClip) -> int:
 def test_grasps_and_drives_are_compared_with_their_curves(make: Make, tmp_path: Path) -> None:
     def probed(gain: float, lies: list[float]) -> Result:
         plain = toy.result(gain)
-        curves = {
+        curves: dict[str, list[float | None]] = {
             "contact_offset_cm": [0.0, 2.0, 4.0],
             "contact_simulator": [1.0, 0.5, 0.0],
-            "contact_model": [1.0] * 3,
+            "contact_model": [1.0, 1.0, 1.0],
         }
         curves |= {"drive_frame": [2.0, 3.0], "drive_psnr": [20.0 + gain, 18.0 + gain]}
-        scores = {"contact_false_success": float(np.mean(lies)), "drive_psnr": 19.0 + gain}
+        scores: dict[str, float | None] = {"contact_false_success": float(np.mean(lies)), "drive_psnr": 19.0 + gain}
         per_clip = {"contact_false_success": lies, "drive_psnr": [18.0 + gain, 20.0 + gain]}
         return replace(
             plain,
