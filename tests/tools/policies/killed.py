@@ -1,27 +1,11 @@
-"""``experiments.adapt``, killed without warning: ``python -m tests.tools.policies.killed PLACE RUN …``.
+"""``experiments.adapt``, killed without warning after a checkpoint of the world model's training.
 
-PLACE is ``rollouts`` (the policy has acted in one of its groups of episodes) or ``world_model`` (after the checkpoint
-of step 2).
+``python -m tests.tools.policies.killed RUN …``.
 """
 
-import sys
-from pathlib import Path
-
 from experiments.adapt import main
-from rsjax.tools.policies import on_policy
-from tests.tools.pipeline.killed import die, in_world_model
-
-
-def in_rollouts() -> None:
-    write = on_policy.write_file
-
-    def dying(path: Path, payload: bytes) -> None:
-        write(path, payload)
-        die()
-
-    on_policy.write_file = dying  # type: ignore[assignment]
-
+from tests.tools.pipeline.killed import in_world_model
 
 if __name__ == "__main__":
-    {"rollouts": in_rollouts, "world_model": in_world_model}[sys.argv.pop(1)]()
+    in_world_model()
     main()

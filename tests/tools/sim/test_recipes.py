@@ -84,7 +84,7 @@ def test_grasps_of_a_group_share_start_and_approach_and_about_half_succeed(sim: 
 def test_free_driving_reaches_all_edges_with_open_and_closed_fingers() -> None:
     """Without physics: the gripper is where the actions send it."""
     goals, fingers, toggled, reversed_ = [], [], 0, 0
-    for place in range(60):
+    for place in range(100):
         plan = scripted(CONFIG, "driving", place, "x")
         assert plan.manner is not None
         expert = plan.manner.expert(np.random.default_rng(place))
