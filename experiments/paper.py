@@ -33,7 +33,7 @@ class Options:
     """Directory of trainings and report; several budgets can share it."""
     data_dir: Path = Path("data")
     """Directory of simulated data sets."""
-    preset: str = "tiny"
+    preset: str = "roboscape_tiny"
     """The preset that the trainings vary."""
     seeds: int = 3
     """Trainings of each arm."""

@@ -83,7 +83,7 @@ def tiny(place: Path) -> dict[str, Any]:
     short = [*(f"--{section}.steps=100" for section in SECTIONS), "--runtime.log-every=1"]
     few = ["--sim.episodes=40", "--sim.test-episodes=4", "--eval.clips=2", "--eval.action-draws=1"]
     off = ["--runtime.eval-every=0"]
-    run("train", "tiny", "--run-dir", f"{place}/tiny", "--data-dir", f"{place}/data", *short, *few, *off)
+    run("train", "roboscape_tiny", "--run-dir", f"{place}/tiny", "--data-dir", f"{place}/data", *short, *few, *off)
     return {stage: curve(place / "tiny" / stage) for stage in ("tokenizer", "world_model")}
 
 

@@ -45,7 +45,10 @@ def test_a_full_size_preset_has_no_departure(name: str) -> None:
     assert active(model) == {}
 
 
-@pytest.mark.parametrize(("name", "departures"), [("debug", KEYPOINTS), ("tiny", TINY), ("multitask", TINY)])
+SMALL = {"debug": KEYPOINTS, "tiny": TINY, "roboscape_tiny": TINY, "multitask": TINY}
+
+
+@pytest.mark.parametrize(("name", "departures"), SMALL.items())
 def test_a_small_preset_has_exactly_these_departures(name: str, departures: dict[str, Any]) -> None:
     assert active(presets.get(name).model) == departures
 

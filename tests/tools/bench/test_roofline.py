@@ -22,9 +22,9 @@ from tests.models.toy_family import ToyConfig
 @pytest.mark.parametrize(
     ("name", "changes"),
     [
-        ("tiny", {}),
-        ("tiny", {"model.depth": "head"}),
-        ("tiny", {"model.depth": SmallDepthBranch(width=64, blocks=2, cells=2)}),
+        ("roboscape_tiny", {}),
+        ("roboscape_tiny", {"model.depth": "head"}),
+        ("roboscape_tiny", {"model.depth": SmallDepthBranch(width=64, blocks=2, cells=2)}),
         ("genie_35m", {}),
         ("roboscape_s", {}),
     ],

@@ -20,7 +20,7 @@ from rsjax.tools.studies.paper.run import print_plan
 from tests.tools.studies.paper import toy
 
 DATA = Path("data")
-TINY = presets.tiny()
+TINY = presets.roboscape_tiny()
 KNOWN = tuple(claims().values())
 
 
@@ -145,7 +145,7 @@ def test_equal_time_is_equal_steps_times_their_seconds(three_hours: Plan) -> Non
     assert genie.train.steps * step_seconds(genie) == pytest.approx(base.train.steps * step_seconds(base), rel=0.01)
 
 
-@pytest.mark.parametrize(("preset", "simple"), [("tiny", 0.55), ("multitask", 0.5)])
+@pytest.mark.parametrize(("preset", "simple"), [("roboscape_tiny", 0.55), ("multitask", 0.5)])
 def test_a_curriculum_and_its_mixture_read_the_same_clips_in_as_many_steps(preset: str, simple: float) -> None:
     """With as many clips of each difficulty as expected, every clip is drawn as often in both."""
     at = scale(presets.get(preset), 3 * HOUR)

@@ -126,7 +126,8 @@ def test_policies_are_judged_in_every_family_with_actions() -> None:
     assert [arm.model or arm.preset for arm in claim.arms] == ["", "genie", "ivideogpt", "irasim"]
     compared = {(each.metric, each.than) for each in claim.comparisons}
     assert {(metric, arm.name) for arm in claim.arms[1:] for metric in ("correlation", "same_outcome")} < compared
-    seconds = [seconds_of("policies judged", presets.get(name)) for name in ("tiny", "ivideogpt_tiny", "irasim_tiny")]
+    names = ("roboscape_tiny", "ivideogpt_tiny", "irasim_tiny")
+    seconds = [seconds_of("policies judged", presets.get(name)) for name in names]
     assert seconds[0] < seconds[1] < seconds[2]
 
 
@@ -142,4 +143,4 @@ def test_cells_on_other_simulators_than_lift_train_no_judge_and_cost_nothing(tmp
 
 
 def _with_clips(clips: int) -> Config:
-    return with_values(presets.tiny(), {"eval.clips": clips})
+    return with_values(presets.roboscape_tiny(), {"eval.clips": clips})
