@@ -27,8 +27,11 @@ KIND is one of
 
 # The kinds that each option belongs to.
 BELONGS = {
+    "export": ("tokenizer", "genie", "ivideogpt", "irasim", "sdxl", "cogvideox"),
     "weights": ("tokenizer", "irasim"),
     "heads": ("genie", "ivideogpt", "irasim"),
+    "conditioning": ("irasim",),
+    "final_frame_ada": ("irasim",),
     "part": ("ivideogpt", "cogvideox"),
     "task": ("text",),
     "store": ("text",),
@@ -47,16 +50,23 @@ class Options:
     ] = tyro.MISSING
     """What to convert."""
     source: tyro.conf.Positional[Path | None] = None
-    """IN, a public file, or a directory made here."""
+    """IN, a public file, the index of several, or the directory of a published model; with --export one made here."""
     out: tyro.conf.Positional[Path | None] = None
-    """OUT, a directory, or a .safetensors file. With --net, the default is where evaluations look for it."""
+    """OUT, a directory; with --export a .safetensors file. With --net, the default is where evaluations look for it."""
+    export: bool = False
+    """Export a network of IN, a directory made here, under its public names."""
     weights: Literal["raw", "ema"] | None = None
     """The weights themselves or their moving average. Default: raw for tokenizer, ema for irasim."""
     heads: int | None = None
     """Attention heads: of genie without a config.json, of ivideogpt if not of 64 channels, of irasim if the width is
     none of the public sizes."""
+    conditioning: Literal["frame", "video"] | None = None
+    """Whether irasim reads one action at a time (Frame-Ada) or those of a clip together (Video-Ada), where the shapes
+    allow both."""
+    final_frame_ada: bool = False
+    """The last layer of irasim's Frame-Ada sees the actions. The published weights were trained without."""
     part: Literal["tokenizer", "world_model"] | None = None
-    """Which one of ivideogpt or cogvideox to export, if there are both."""
+    """Which one of ivideogpt or cogvideox to convert, if IN holds both. Default: import both, export the only one."""
     task: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """A task for text, in words; as often as needed."""
     store: Path | None = None
@@ -89,6 +99,9 @@ def main(argv: Sequence[str]) -> None:
         return
     assert options.source is not None
     assert options.out is not None
+    if options.export:
+        print(*_export(options.kind, options.source, options.out, options.part), sep="\n")
+        return
     if options.kind == "tokenizer":
         lines = tokenizer.convert(options.source, options.out, options.weights or "raw")
     elif options.kind == "genie":
@@ -100,7 +113,8 @@ def main(argv: Sequence[str]) -> None:
     elif options.kind == "text":
         lines = cogvideox.embed_texts(options.source, options.out, options.task, options.store, options.tokens)
     elif options.kind == "irasim":
-        lines = irasim.convert(options.source, options.out, options.weights or "ema", options.heads)
+        variant = irasim.Variant(options.heads, options.conditioning, options.final_frame_ada)
+        lines = irasim.convert(options.source, options.out, options.weights or "ema", variant)
     elif options.kind == "sdxl":
         lines = kl_autoencoder.convert(options.source, options.out)
     else:
@@ -109,6 +123,20 @@ def main(argv: Sequence[str]) -> None:
             files.append(options.heads_file)
         lines = lpips.convert(files, options.out)
     print(*lines, sep="\n")
+
+
+def _export(kind: str, source: Path, out: Path, part: Literal["tokenizer", "world_model"] | None) -> list[str]:
+    from rsjax.tools.convert import cogvideox, genie, irasim, ivideogpt, kl_autoencoder, tokenizer
+
+    require(
+        source.is_dir(), f"{source}: is no directory made here, to export from; leave out --export to import a file"
+    )
+    if kind == "ivideogpt":
+        return ivideogpt.export(source, out, part)
+    if kind == "cogvideox":
+        return cogvideox.export(source, out, part)
+    one = {"tokenizer": tokenizer, "genie": genie, "irasim": irasim, "sdxl": kl_autoencoder}
+    return one[kind].export(source, out)
 
 
 if __name__ == "__main__":

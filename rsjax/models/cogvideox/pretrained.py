@@ -44,6 +44,8 @@ def shapes_of(directory: Path, own: CogVideoXConfig) -> Params:
     for name, (there, here) in alike.items():
         if there != here:
             raise UserError(f"{directory}: holds another network ({name} is {there} there, {here} here); set it alike")
+    if saved.noise != own.noise:
+        note(f"{directory}: was trained with model.noise {saved.noise}, this model has {own.noise}")
     if saved.learned_positions and not own.learned_positions:
         note(f"{directory}: its learned positions, of {saved.learned_positions} frames and cells, are left aside")
     return shapes(saved_architecture(saved))

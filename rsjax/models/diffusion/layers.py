@@ -25,7 +25,8 @@ def grid_positions(rows: int, columns: int, width: int, scale: float = 1.0) -> F
 
 
 def _waves(at: np.ndarray, width: int) -> np.ndarray:
-    angles = at[:, None] * PERIOD ** -(np.arange(width // 2) / (width // 2))
+    # Written as in the public code of IRASim and diffusers, so that rounding in float32 gives the same bits.
+    angles = at[:, None] * (1.0 / PERIOD ** (np.arange(width // 2) / (width / 2.0)))
     return np.concatenate([np.sin(angles), np.cos(angles)], axis=1)
 
 

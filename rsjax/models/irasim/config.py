@@ -18,8 +18,11 @@ class DiTConfig:
     # frame: each action modulates the blocks within its frame (the paper's Frame-Ada). video: all actions together
     # modulate every block (Video-Ada).
     conditioning: Literal["frame", "video"] = "frame"
-    # Between the two linear layers of the action encoder; none: as in the public model of Language-Table.
+    # Between the two linear layers of the action encoder; none: as in the public models of Language-Table. Its
+    # Video-Ada encodes each action by them, and all of a clip by an MLP that follows.
     action_activation: Literal["gelu", "none"] = "gelu"
+    final_frame_ada: bool = False  # frame: actions modulate the last layer, too; the published weights lack it
+    learn_sigma: bool = False  # outputs variances beside the noise; they are neither trained nor read
     integrate_actions: bool = False  # also the sum of all actions so far; see TransformerConfig
     width: int = 1152
     blocks: int = 28  # half of them within frames, half over time
@@ -40,6 +43,11 @@ class DiTConfig:
         require(
             self.blocks % 2 == 0,
             f"model.blocks is {self.blocks}; half of the blocks attend over time, so it must be even",
+        )
+        require(
+            self.conditioning == "frame" or not self.final_frame_ada,
+            "model.final_frame_ada belongs to model.conditioning frame; with video the last layer always sees the "
+            "actions, so leave it out",
         )
 
 

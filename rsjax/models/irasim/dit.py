@@ -48,6 +48,16 @@ class Architecture(DiTConfig):
         """Rows and columns of a frame's tokens."""
         return self.rows // self.patch_size, self.columns // self.patch_size
 
+    @property
+    def outputs(self) -> int:
+        """Channels of the output: the noise and, with ``learn_sigma``, variances."""
+        return self.channels * (1 + self.learn_sigma)
+
+    @property
+    def clip_mlp(self) -> bool:
+        """Whether actions are encoded one by one and then all together, as in Language-Table's Video-Ada."""
+        return self.conditioning == "video" and self.action_activation == "none"
+
 
 def architecture(config: Config) -> Architecture:
     """Returns the architecture of a configuration whose model is IRASim."""
@@ -141,8 +151,11 @@ class DiT(nn.Module):
         # In the public Frame-Ada model the last layer does not see the actions. This is an oversight, but the public
         # weights were trained so.
         plain = time
+        last = time
         if cfg.conditioning == "video":
             plain = acted
+        if cfg.conditioning == "video" or cfg.final_frame_ada:
+            last = acted
         pair: Any = Pair
         if cfg.remat == "blocks":
             pair = nn.remat(Pair, prevent_cse=cfg.unroll > 1)
@@ -155,19 +168,23 @@ class DiT(nn.Module):
             unroll=min(cfg.unroll, pairs),
         )
         x, _ = scan(cfg, name="blocks")(x, (acted, plain), jnp.arange(pairs) == 0)
-        return self._unpatchify(self._final(x, plain))
+        return self._unpatchify(self._final(x, last))[..., : cfg.channels]
 
     def _action(self, actions: Float[Array, "B T A"], drop: Bool[Array, " B"] | None) -> Float[Array, "B t D"]:
         """Returns the embedding of the actions: one for each frame, or one for all."""
         cfg = self.config
         unknown = self.param("unknown_action", nn.initializers.normal(1.0), (1, cfg.width))  # torch's default
         known = actions[:, 1:]
-        if cfg.conditioning == "video":
+        dense = partial(nn.Dense, kernel_init=XAVIER)
+        if cfg.conditioning == "video" and not cfg.clip_mlp:
             known = known.reshape(len(known), 1, -1)
-        x = nn.Dense(cfg.mlp_ratio * cfg.width, kernel_init=XAVIER, name="action_fc1")(known)
+        x = dense(cfg.mlp_ratio * cfg.width, name="action_fc1")(known)
         if cfg.action_activation == "gelu":
             x = nn.gelu(x, approximate=True)
-        x = nn.Dense(cfg.width, kernel_init=XAVIER, name="action_fc2")(x)
+        x = dense(cfg.width, name="action_fc2")(x)
+        if cfg.clip_mlp:
+            x = x.reshape(len(x), 1, -1)
+            x = dense(cfg.width, name="clip_fc2")(nn.gelu(dense(x.shape[-1], name="clip_fc1")(x), approximate=True))
         if cfg.conditioning == "frame":
             x = jnp.concatenate([jnp.broadcast_to(unknown, (len(x), 1, cfg.width)), x], axis=1)
         if drop is None:
@@ -178,14 +195,14 @@ class DiT(nn.Module):
         cfg = self.config
         ada = nn.Dense(2 * cfg.width, kernel_init=ZEROS, name="final_ada")(nn.silu(condition))
         shift, scale = jnp.split(ada, 2, axis=-1)
-        return nn.Dense(cfg.patch_size**2 * cfg.channels, kernel_init=ZEROS, name="final")(modulate(x, shift, scale))
+        return nn.Dense(cfg.patch_size**2 * cfg.outputs, kernel_init=ZEROS, name="final")(modulate(x, shift, scale))
 
-    def _unpatchify(self, x: Float[Array, "B T S out"]) -> Float[Array, "B T h w C"]:
+    def _unpatchify(self, x: Float[Array, "B T S out"]) -> Float[Array, "B T h w outputs"]:
         cfg = self.config
         p = cfg.patch_size
         rows, columns = cfg.grid
-        x = x.reshape(*x.shape[:2], rows, columns, p, p, cfg.channels).swapaxes(3, 4)
-        return x.reshape(*x.shape[:2], cfg.rows, cfg.columns, cfg.channels)
+        x = x.reshape(*x.shape[:2], rows, columns, p, p, cfg.outputs).swapaxes(3, 4)
+        return x.reshape(*x.shape[:2], cfg.rows, cfg.columns, cfg.outputs)
 
     def init_params(self, key: Key[Array, ""]) -> Params:
         """Returns initial parameters, with which the network predicts zeros."""
@@ -203,14 +220,17 @@ def forward_flops(config: Architecture) -> int:
     linear = (4 + 2 * config.mlp_ratio) * width**2  # qkv, proj, fc1, fc2
     attention = (cells + frames) * width  # scores and weighted sums, averaged over both kinds of blocks
     patches = 2 * config.patch_size**2 * config.channels * width
-    if config.conditioning == "frame":
-        acted = frames
-        rows = frames - 1  # of actions that the encoder takes one by one
-        inputs = config.action_inputs
-    else:
+    acted = frames
+    rows = frames - 1  # of actions that the encoder takes one by one
+    inputs = config.action_inputs
+    joint = 0
+    if config.conditioning == "video":
         acted = 1
+    if config.clip_mlp:
+        joint = rows * width * (rows * width + width)
+    elif config.conditioning == "video":
+        inputs = rows * config.action_inputs
         rows = 1
-        inputs = (frames - 1) * config.action_inputs
     conditions = config.blocks // 2 * (acted + 1) * 6 * width**2 + 2 * width**2 + (TIME_CHANNELS + width) * width
-    encoder = rows * config.mlp_ratio * width * (inputs + width)
+    encoder = rows * config.mlp_ratio * width * (inputs + width) + joint
     return 2 * (frames * cells * (config.blocks * (linear + attention) + patches) + conditions + encoder)

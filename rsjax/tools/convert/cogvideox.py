@@ -1,7 +1,7 @@
 """Maps the names of ``diffusers``' CogVideoX: AutoencoderKLCogVideoX and CogVideoXTransformer3DModel.
 
 The ``config.json`` that is published beside the weights contains what they do not reveal: the scaling factor of the
-latents, and how positions are encoded. The weights of a large transformer are in several files; name any one of them.
+latents, and how positions are encoded. The pipeline's ``scheduler_config.json`` contains the forward process.
 """
 
 import importlib
@@ -20,28 +20,28 @@ from rsjax.clip import UNKNOWN
 from rsjax.config import ConfigError
 from rsjax.data.store import open_store
 from rsjax.errors import first_line
-from rsjax.files import write_file
+from rsjax.files import read_json, write_file, write_json
 from rsjax.models.cogvideox import autoencoder
 from rsjax.models.cogvideox.config import CausalVAEConfig, CogVideoXConfig
 from rsjax.models.cogvideox.pretrained import saved_architecture
 from rsjax.models.cogvideox.text import EMPTY, write_texts
 from rsjax.models.cogvideox.transformer import shapes
+from rsjax.models.diffusion.config import NoiseConfig
 from rsjax.models.saved import Inputs, read_model
 from rsjax.tools.convert.directory import Part, save_part, saved_part
 from rsjax.tools.convert.files import (
     REPLACES,
-    SAFE,
     SETTINGS,
     ConvertError,
-    TensorFile,
     Tensors,
     check_file,
+    described,
     left_aside,
     published_settings,
-    read_tensors,
     setting,
     write_published,
 )
+from rsjax.tools.convert.sources import read_network, weights_files
 from rsjax.tools.convert.table import (
     SAME_NAMES,
     Entry,
@@ -71,7 +71,8 @@ _PARTS = (
     (r"\b(kernel|scale)$", "weight"),
 )
 PARTS: tuple[Part, Part] = ("tokenizer", "world_model")
-_SHARD = re.compile(r"(.*)-(\d{5})-of-(\d{5})\.safetensors")
+FOLDERS: dict[Part, str] = {"tokenizer": "vae", "world_model": "transformer"}  # of a whole public pipeline
+SCHEDULER = "scheduler_config.json"
 TOKENS = 226
 
 
@@ -281,20 +282,24 @@ def transformer_settings(config: CogVideoXConfig) -> dict[str, Any]:
 
 
 def convert(source: Path, out: Path, part: Part | None = None) -> list[str]:
-    """Imports a public autoencoder or transformer into a directory, or exports a directory's to a safetensors file.
+    """Imports a public autoencoder or transformer into a directory, or both from the directory of a pipeline.
 
     Args:
         source: the file or directory; if a network has several files (``…-00001-of-00003.safetensors``), any of them.
-        part: the part to export; None: the only one.
+        part: the part to import of a pipeline; None: both.
 
     Raises:
         UserError: the source cannot be read or does not fit, or ``out`` cannot be written.
     """
-    if source.is_dir():
-        return [_export(source, out, part)]
-    tensors, _, names, others, _ = _read(source)
+    return [line for file in weights_files(source, FOLDERS, part) for line in _convert(file, out)]
+
+
+def _convert(source: Path, out: Path) -> list[str]:
+    tensors, _, names, others, _ = read_network(source)
     settings = published_settings(source, *CLASSES.values())
     vae = is_autoencoder(source, tensors)
+    part: Part
+    other: Part
     if vae:
         part, other = PARTS
     else:
@@ -312,9 +317,15 @@ def convert(source: Path, out: Path, part: Part | None = None) -> list[str]:
     else:
         model, params, aside = transformer_from_public(source, tensors, settings, names)
         network = model.autoencoder
-        model = replace(model, autoencoder=before.autoencoder if before else network)
-        lines = [f"{out}: a transformer of {len(tensors) - aside} tensors, {model}"]
+        noise = forward_process(source)
+        model = replace(model, noise=noise or model.noise, autoencoder=before.autoencoder if before else network)
+        lines = [f"{out}: a transformer of {len(tensors) - aside} tensors, {described(model)}"]
         lines += left_aside({"fixed positions, which the network computes": aside}, others)
+        if noise is None:
+            shift = model.noise.snr_shift
+            lines.append(f"no {SCHEDULER} of a pipeline: snr_shift_scale {shift:g} is taken, as of 5B; 2B's is 3")
+        else:
+            lines.append(f"the pipeline's forward process: {described(noise)}")
     if before and before.autoencoder.latent_channels != network.latent_channels:
         there = before.autoencoder.latent_channels
         here = network.latent_channels
@@ -323,18 +334,65 @@ def convert(source: Path, out: Path, part: Part | None = None) -> list[str]:
     return lines
 
 
-def _read(source: Path) -> TensorFile:
-    """Returns the content of a file, or of all files of a network if the file is one of several."""
-    if not (match := _SHARD.fullmatch(source.name)):
-        return read_tensors(source)
-    numbers = range(1, int(match[3]) + 1)
-    files = [read_tensors(source.with_name(f"{match[1]}-{i:05d}-of-{match[3]}{SAFE}")) for i in numbers]
-    tensors = {name: x for file in files for name, x in file.tensors.items()}
-    names = {name: known for file in files for name, known in file.names.items()}
-    return TensorFile(tensors, {}, names, {}, "")
+def forward_process(weights: Path) -> NoiseConfig | None:
+    """Returns the forward process that a pipeline's scheduler describes; None if there is no such file.
+
+    Args:
+        weights: a file of the transformer; the scheduler's settings are beside it, or in the folder ``scheduler``
+            beside its folder.
+
+    Raises:
+        UserError: the file is damaged, or describes a process that this project does not have.
+    """
+    places = [weights.parent / SCHEDULER, weights.parent.parent / "scheduler" / SCHEDULER]
+    path = next((path for path in places if path.exists()), None)
+    if path is None:
+        return None
+    settings = read_json(path, cure="put the published one there, or delete it")
+    known = {"v_prediction": "velocity", "epsilon": "noise"}
+    predicted = settings.get("prediction_type", "v_prediction")
+    betas = settings.get("beta_schedule", "scaled_linear")
+    if predicted not in known or betas not in ("linear", "scaled_linear"):
+        raise ConvertError(
+            f"{path}: prediction_type {predicted!r:.80} with beta_schedule {betas!r:.80} is not supported, only "
+            f"{' or '.join(known)} with linear or scaled_linear"
+        )
+    read = partial(setting, path, settings)
+    try:
+        return NoiseConfig(
+            steps=read("num_train_timesteps", 1000),
+            beta_start=read("beta_start", 0.00085),
+            beta_end=read("beta_end", 0.012),
+            betas=betas,
+            prediction=known[predicted],  # type: ignore[arg-type]
+            snr_shift=float(read("snr_shift_scale", 1.0)),
+            zero_terminal=read("rescale_betas_zero_snr", True),
+        )
+    except ConfigError as error:
+        raise ConvertError(f"{path}: describes no forward process of this project ({error}); restore it") from error
 
 
-def _export(source: Path, out: Path, part: Part | None) -> str:
+def scheduler_settings(noise: NoiseConfig) -> dict[str, Any]:
+    """Returns the settings of the public scheduler; the inverse of :func:`forward_process`."""
+    predicted = {"velocity": "v_prediction", "noise": "epsilon"}
+    return {
+        "_class_name": "CogVideoXDDIMScheduler",
+        "num_train_timesteps": noise.steps,
+        "beta_start": noise.beta_start,
+        "beta_end": noise.beta_end,
+        "beta_schedule": noise.betas,
+        "prediction_type": predicted[noise.prediction],
+        "snr_shift_scale": noise.snr_shift,
+        "rescale_betas_zero_snr": noise.zero_terminal,
+    }
+
+
+def export(source: Path, out: Path, part: Part | None = None) -> list[str]:
+    """Exports a directory's autoencoder or transformer to a safetensors file. Errors as in :func:`convert`.
+
+    Args:
+        part: the part to export; None: the only one.
+    """
     replaces = check_file(out)
     parts = [p for p in PARTS if saved_part(source, CogVideoXConfig, p)]
     if part not in parts and len(parts) != 1:
@@ -354,8 +412,10 @@ def _export(source: Path, out: Path, part: Part | None) -> str:
         entries = transformer_table(model)
     tensors = to_tensors(params, entries)
     write_published(out, tensors, settings)
+    if part == "world_model":
+        write_json(out.parent / SCHEDULER, scheduler_settings(model.noise))
     text = f"under their public names; settings in {SETTINGS}{replaces}"
-    return f"{out}: {len(tensors)} tensors of CogVideoX's {part}, {text}"
+    return [f"{out}: {len(tensors)} tensors of CogVideoX's {part}, {text}"]
 
 
 def embed_texts(source: Path, out: Path, tasks: Sequence[str], store: Path | None, tokens: int = TOKENS) -> list[str]:

@@ -5,6 +5,7 @@ import json
 import math
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -101,6 +102,12 @@ def read_tensors(path: Path, holders: Sequence[str] = HOLDERS) -> TensorFile:
             raise ConvertError(f"{path}: {own} occurs twice, as {names[own]} and as {name}; keep one of them")
         names[own] = name
     return TensorFile({own: read[name] for own, name in names.items()}, metadata, names, others, key)
+
+
+def described(settings: Any) -> str:
+    """Returns the fields of a model's settings, without nested ones: those belong to other networks."""
+    values = {field.name: getattr(settings, field.name) for field in fields(settings)}
+    return ", ".join(f"{name} {value}" for name, value in values.items() if not is_dataclass(value))
 
 
 def left_aside(*groups: Mapping[str, int]) -> list[str]:

@@ -23,9 +23,9 @@ from rsjax.tools.convert.files import (
     check_file,
     check_type,
     left_aside,
-    read_tensors,
     write_published,
 )
+from rsjax.tools.convert.sources import read_network, weights_file
 from rsjax.tools.convert.table import (
     SAME_NAMES,
     Entry,
@@ -206,19 +206,13 @@ def from_public(
 
 
 def convert(source: Path, out: Path, heads: int | None) -> list[str]:
-    """Imports a public Genie into a directory, or exports a directory's world model to a safetensors file.
+    """Imports a public Genie into a directory.
 
     Raises:
         UserError: the source cannot be read or does not fit, or ``out`` cannot be written.
     """
-    if source.is_dir():
-        replaces = check_file(out)
-        config, params = load_world_model(source)
-        tensors = to_tensors(params, table(config))
-        write_published(out, tensors, settings_of(config))
-        text = f"under their public names; settings in {SETTINGS}{replaces}"
-        return [f"{out}: {len(tensors)} tensors of a Genie, {text}"]
-    tensors, _, names, others, _ = read_tensors(source)
+    source = weights_file(source)
+    tensors, _, names, others, _ = read_network(source)
     settings = read_settings(source)
     config, params = from_public(source, tensors, settings, heads, names)
     replaces = REPLACES * save(out, config, params)
@@ -226,3 +220,13 @@ def convert(source: Path, out: Path, heads: int | None) -> list[str]:
     if settings.get("use_mup") is None:
         lines.append(f"no use_mup in a {SETTINGS} beside {source.name}: converted as a model without muP")
     return lines
+
+
+def export(source: Path, out: Path) -> list[str]:
+    """Exports a directory's world model to a safetensors file. Errors as in :func:`convert`."""
+    replaces = check_file(out)
+    config, params = load_world_model(source)
+    tensors = to_tensors(params, table(config))
+    write_published(out, tensors, settings_of(config))
+    text = f"under their public names; settings in {SETTINGS}{replaces}"
+    return [f"{out}: {len(tensors)} tensors of a Genie, {text}"]

@@ -1,15 +1,15 @@
 """Maps the names of the public IRASim checkpoints to the transformer's parameters.
 
-The weights' shapes reveal neither the number of heads nor the token grid of a frame; the parameters do not depend on
-the grid. The file's fixed positions are left aside: the network computes its own.
+The weights' shapes reveal neither the number of heads, nor whether the last layer of Frame-Ada sees the actions. The
+file's fixed positions identify the token grid of a frame and are then left aside: the network computes its own.
 """
 
 import json
-import math
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import jax
+import numpy as np
 
 from rsjax.config import ConfigError, to_dict
 from rsjax.models.diffusion.layers import grid_positions, positions
@@ -23,15 +23,36 @@ from rsjax.tools.convert.files import (
     check_file,
     exported_config,
     left_aside,
-    read_tensors,
     write_safetensors,
 )
+from rsjax.tools.convert.sources import read_network, weights_file
 from rsjax.tools.convert.table import SAME_NAMES, Entry, Names, Table, shape_of, to_params, to_tensors, weight_and_bias
 from rsjax.trainable import Params
 
 METADATA = "rsjax.irasim"  # key of the architecture in the metadata of an exported file
 FIXED = ("pos_embed", "temp_embed")
 HEADS = {1152: 16, 1024: 16, 768: 12, 384: 6}  # attention heads of the public sizes, by width
+PUBLIC_VIDEO = (15 * 7, 16)  # numbers that the public Video-Ada reads, of so many frames
+ROUNDING = 1e-6  # of positions, whose neighbours differ by far more
+
+Conditioning = Literal["frame", "video"]
+
+
+class Variant(NamedTuple):
+    """What a file's tensors do not reveal.
+
+    Attributes:
+        heads: attention heads; None: those of the public sizes.
+        conditioning: of one action at a time or of a whole clip, where the shapes allow both.
+        final_frame_ada: whether the last layer of Frame-Ada sees the actions, which no shape shows.
+    """
+
+    heads: int | None = None
+    conditioning: Conditioning | None = None
+    final_frame_ada: bool = False
+
+
+VARIANT = Variant()
 
 
 def table(config: Architecture) -> Table:
@@ -53,6 +74,11 @@ def table(config: Architecture) -> Table:
         *weight_and_bias("final_layer.linear", "final", "linear"),
         *weight_and_bias("final_layer.adaLN_modulation.1", "final_ada", "linear"),
     ]
+    if config.clip_mlp:
+        entries += [
+            *weight_and_bias("mlp.fc1", "clip_fc1", "linear"),
+            *weight_and_bias("mlp.fc2", "clip_fc2", "linear"),
+        ]
     parts = {"attn.qkv": "qkv", "attn.proj": "proj", "mlp.fc1": "fc1", "mlp.fc2": "fc2", "adaLN_modulation.1": "ada"}
     for i in range(config.blocks):
         path = f"blocks/{('spatial', 'temporal')[i % 2]}"
@@ -61,15 +87,18 @@ def table(config: Architecture) -> Table:
     return tuple(entries)
 
 
-def infer_config(source: object, tensors: Tensors, heads: int | None = None, names: Names = SAME_NAMES) -> Architecture:
-    """Infers the network from the names and shapes of its tensors.
+def infer_config(
+    source: object, tensors: Tensors, variant: Variant = VARIANT, names: Names = SAME_NAMES
+) -> Architecture:
+    """Infers the network from its tensors.
 
     Args:
-        heads: attention heads, needed if the width is none of the public sizes'.
+        variant: what the tensors do not reveal.
         names: the tensors' names in the file, where they differ, for error messages.
 
     Raises:
-        ConvertError: the tensors are not an IRASim's, or leave the number of heads unknown.
+        ConvertError: the tensors are not an IRASim's; they leave the number of heads or the way of conditioning
+            unknown; or the positions are those of no grid.
     """
 
     def shape(key: str, axes: int) -> tuple[int, ...]:
@@ -78,20 +107,25 @@ def infer_config(source: object, tensors: Tensors, heads: int | None = None, nam
     if not {"mask_emb_fn.weight", "x_embedder.proj.weight"} <= tensors.keys():
         raise ConvertError(f"{source}: holds no weights of an IRASim, such as mask_emb_fn.weight")
     width, channels, patch, _ = shape("x_embedder.proj.weight", 4)
-    (_, cells, _) = shape("pos_embed", 3)
     (_, frames, _) = shape("temp_embed", 3)
     linear = "embed_arm_state.weight" in tensors
     inputs = shape("embed_arm_state.weight" if linear else "embed_state.fc1.weight", 2)[1]
-    # Frame-Ada reads one action at a time; Video-Ada reads all (frames - 1) actions of a clip.
-    video = frames > 2 and inputs % (frames - 1) == 0 and inputs > frames - 1
-    heads = heads or HEADS.get(width)
+    if linear:
+        conditioning: Conditioning = "video" if "mlp.fc1.weight" in tensors else "frame"
+    else:
+        conditioning = _conditioning(source, inputs, frames, variant.conditioning)
+        if conditioning == "video":
+            inputs = inputs // (frames - 1)
+    heads = variant.heads or HEADS.get(width)
     if heads is None:
         raise ConvertError(f"{source}: of width {width}, which is none of the public sizes; set --heads")
-    rows = max(rows for rows in range(1, math.isqrt(cells) + 1) if cells % rows == 0)
+    rows, columns = _grid(source, tensors, names)
     try:
         return Architecture(
-            conditioning="video" if video else "frame",
+            conditioning=conditioning,
             action_activation="none" if linear else "gelu",
+            final_frame_ada=variant.final_frame_ada,
+            learn_sigma=shape("final_layer.linear.weight", 2)[0] == 2 * patch**2 * channels,
             width=width,
             blocks=sum(name.startswith("blocks.") and name.endswith(".attn.qkv.weight") for name in tensors),
             heads=heads,
@@ -99,31 +133,73 @@ def infer_config(source: object, tensors: Tensors, heads: int | None = None, nam
             patch_size=patch,
             frames=frames,
             rows=rows * patch,
-            columns=cells // rows * patch,
+            columns=columns * patch,
             channels=channels,
-            action_inputs=inputs // (frames - 1) if video else inputs,
+            action_inputs=inputs,
         )
     except ConfigError as error:
         raise ConvertError(f"{source}: the network inferred from its tensors cannot be built: {error}") from error
+
+
+def _conditioning(source: object, inputs: int, frames: int, told: Conditioning | None) -> Conditioning:
+    """Returns whether an encoder of so many numbers reads one action at a time, or all frames - 1 of a clip."""
+    if frames < 2 or inputs % (frames - 1):
+        if told == "video":
+            raise ConvertError(
+                f"{source}: reads {inputs} numbers, which the {frames - 1} actions of a clip do not divide; leave out "
+                f"--conditioning video"
+            )
+        return "frame"
+    if told is None and (inputs, frames) != PUBLIC_VIDEO:
+        raise ConvertError(
+            f"{source}: reads {inputs} numbers, which are one action or those of all {frames - 1} in a clip; set "
+            f"--conditioning frame or --conditioning video"
+        )
+    return told or "video"
+
+
+def _grid(source: object, tensors: Tensors, names: Names) -> tuple[int, int]:
+    """Returns rows and columns of the tokens whose fixed positions a file holds.
+
+    Raises:
+        ConvertError: no grid, or no clip, has these positions.
+    """
+    _, cells, width = shape_of(source, tensors, "pos_embed", 3, names)
+    _, frames, _ = shape_of(source, tensors, "temp_embed", 3, names)
+    time = tensors["temp_embed"][0]
+    grids = [(rows, cells // rows) for rows in range(1, cells + 1) if cells % rows == 0]
+    fitting = [grid for grid in grids if _near(tensors["pos_embed"][0], grid_positions(*grid, width))]
+    for name, fits in (("pos_embed", bool(fitting)), ("temp_embed", _near(time, positions(frames, time.shape[-1])))):
+        if not fits:
+            known = names.get(name, name)
+            raise ConvertError(
+                f"{source}: {known} holds no sines and cosines of the positions of {tensors[name].shape[1]} "
+                f"{'cells in rows and columns' if name == 'pos_embed' else 'frames'}, as the public files do"
+            )
+    return fitting[0]
+
+
+def _near(x: np.ndarray, y: np.ndarray) -> bool:
+    return x.shape == y.shape and np.allclose(x.astype(np.float32), y, rtol=0, atol=ROUNDING)
 
 
 def from_public(
     source: object,
     tensors: Tensors,
     own: Architecture | None = None,
-    heads: int | None = None,
+    variant: Variant = VARIANT,
     names: Names = SAME_NAMES,
 ) -> tuple[Architecture, Params, int]:
     """Returns a model's architecture, its parameters and how many tensors were left aside.
 
     Args:
         own: the architecture, if the file was exported by this project and states it.
-        heads, names: as for :func:`infer_config`, whose errors it raises.
+        variant, names: as for :func:`infer_config`, whose errors it raises.
 
     Raises:
         ConvertError: in addition, if tensors are missing, unexpected, of the wrong shape or not finite.
     """
-    config = own or infer_config(source, tensors, heads, names)
+    config = own or infer_config(source, tensors, variant, names)
     used = {name: x for name, x in tensors.items() if name not in FIXED}
     shapes = jax.eval_shape(DiT(config).init_params, jax.random.key(0))
     return config, to_params(source, used, table(config), shapes, names), len(tensors) - len(used)
@@ -136,33 +212,38 @@ def to_public(config: Architecture, params: Params) -> Tensors:
     return {"pos_embed": space[None], "temp_embed": time[None]} | to_tensors(params, table(config))
 
 
-def convert(source: Path, out: Path, weights: Literal["ema", "raw"], heads: int | None) -> list[str]:
-    """Imports a public IRASim into a directory, or exports a directory's transformer to a safetensors file.
+def convert(source: Path, out: Path, weights: Literal["ema", "raw"], variant: Variant = VARIANT) -> list[str]:
+    """Imports a public IRASim into a directory.
 
     Args:
         weights: which of the two networks in a public training checkpoint to import.
+        variant: what a public file's tensors do not reveal.
 
     Raises:
         UserError: the source cannot be read or does not fit, or ``out`` cannot be written.
     """
-    if source.is_dir():
-        replaces = check_file(out)
-        config, params = load_irasim(source)
-        tensors = to_public(config, params)
-        write_safetensors(out, tensors, {METADATA: json.dumps(to_dict(config))})
-        return [f"{out}: {len(tensors)} tensors of an IRASim, under their public names{replaces}"]
+    source = weights_file(source)
     holders: tuple[str, ...] = HOLDERS
     if weights == "ema":
         holders = ("ema", *HOLDERS)
-    tensors, metadata, names, others, key = read_tensors(source, holders)
+    tensors, metadata, names, others, key = read_network(source, holders)
     lacking = ""
     if weights == "ema" and key != "ema":
         lacking = ", as it has no ema"
     own = exported_config(Architecture, source, metadata, METADATA)
-    config, params, aside = from_public(source, tensors, own, heads, names)
+    config, params, aside = from_public(source, tensors, own, variant, names)
     replaces = REPLACES * save(out, config, params)
     return [
         f"{out}: an IRASim of {len(tensors) - aside} tensors, {config}{replaces}",
         *([f"read from the file's key {key}{lacking}"] if key else []),
         *left_aside({"fixed positions, which the network computes": aside}, others),
     ]
+
+
+def export(source: Path, out: Path) -> list[str]:
+    """Exports a directory's transformer to a safetensors file. Errors as in :func:`convert`."""
+    replaces = check_file(out)
+    config, params = load_irasim(source)
+    tensors = to_public(config, params)
+    write_safetensors(out, tensors, {METADATA: json.dumps(to_dict(config))})
+    return [f"{out}: {len(tensors)} tensors of an IRASim, under their public names{replaces}"]

@@ -16,7 +16,7 @@ from typing import Any
 import jax
 
 from rsjax.config import ConfigError, from_dict, to_dict
-from rsjax.files import parse_json
+from rsjax.files import parse_json, read_json
 from rsjax.models.ivideogpt.conditional_vq import ConditionalVQ
 from rsjax.models.ivideogpt.config import ConditionalVQConfig, IVideoGPTConfig
 from rsjax.models.ivideogpt.llama import Architecture, LLaMA
@@ -25,13 +25,16 @@ from rsjax.models.saved import Inputs, read_model, saved_inputs
 from rsjax.tools.convert.directory import Part, save_part, saved_part
 from rsjax.tools.convert.files import (
     REPLACES,
+    SETTINGS,
     ConvertError,
     Tensors,
     check_file,
+    check_type,
+    described,
     left_aside,
-    read_tensors,
     write_safetensors,
 )
+from rsjax.tools.convert.sources import read_network, weights_files
 from rsjax.tools.convert.table import (
     SAME_NAMES,
     Entry,
@@ -46,8 +49,10 @@ from rsjax.tools.convert.table import (
 from rsjax.trainable import Params
 from rsjax.training.checkpoint import load_weights
 
+HEADS = "num_attention_heads"  # in the settings of a transformer
 METADATA = "rsjax.ivideogpt"  # metadata key under which an exported file keeps settings and inputs
 PARTS: tuple[Part, ...] = ("tokenizer", "world_model")
+FOLDERS: dict[Part, str] = {"tokenizer": "tokenizer", "world_model": "transformer"}  # of a whole public model
 # Tensors of public transformers that this project does not use: heads for rewards and actions, and fixed rotations.
 ASIDE = re.compile(r"^(reward_linear|action_recon_linear)|rotary_emb\.inv_freq$")
 
@@ -136,18 +141,20 @@ def _count(tensors: Mapping[str, Any], key: Any) -> int:
 
 
 def convert(source: Path, out: Path, heads: int | None = None, part: Part | None = None) -> list[str]:
-    """Imports a public tokenizer or transformer into a directory, or exports a directory's to a safetensors file.
+    """Imports a public tokenizer or transformer into a directory, or both from the directory of a whole model.
 
     Args:
         heads: attention heads of the transformer, see :func:`infer_llama`.
-        part: the part to export; None: the only one.
+        part: the part to import of a whole model; None: both.
 
     Raises:
         UserError: the source cannot be read or does not fit, or ``out`` cannot be written.
     """
-    if source.is_dir():
-        return [_export(source, out, part)]
-    tensors, metadata, names, others, _ = read_tensors(source)
+    return [line for file in weights_files(source, FOLDERS, part) for line in _convert(file, out, heads)]
+
+
+def _convert(source: Path, out: Path, heads: int | None) -> list[str]:
+    tensors, metadata, names, others, _ = read_network(source)
     own = _exported(source, metadata)
     if "dynamics_quantize.embedding.weight" in tensors:
         given = None
@@ -166,7 +173,7 @@ def convert(source: Path, out: Path, heads: int | None = None, part: Part | None
         model = own[0]
         actions = own[1].action_dim
     else:
-        model, actions = infer_llama(source, used, heads, names)
+        model, actions = infer_llama(source, used, heads or _published_heads(source), names)
     shapes = _llama_shapes(model, actions)
     params = to_params(source, used, llama_table(model), shapes, names)
     before = saved_part(out, IVideoGPTConfig, "tokenizer")
@@ -178,10 +185,27 @@ def convert(source: Path, out: Path, heads: int | None = None, part: Part | None
     inputs = Inputs(sizes[0] if sizes else 0, actions)
     replaces = save_part(out, "world_model", whole, inputs, params)
     lines = left_aside(aside, others)
-    return [f"{out}: a transformer of {len(used)} tensors, {model}{REPLACES * replaces}", *lines]
+    return [f"{out}: a transformer of {len(used)} tensors, {described(model)}{REPLACES * replaces}", *lines]
 
 
-def _export(source: Path, out: Path, part: Part | None) -> str:
+def _published_heads(weights: Path) -> int | None:
+    """Returns ``num_attention_heads`` of the settings beside a file of weights, if they say it."""
+    path = weights.parent / SETTINGS
+    if not path.exists():
+        return None
+    heads = read_json(path, cure=f"put the published one beside {weights.name}, or delete it").get(HEADS)
+    check_type(path, HEADS, heads, 1)
+    if heads is not None and heads < 1:
+        raise ConvertError(f"{path}: {HEADS} is {heads}, not above 0")
+    return heads  # type: ignore[no-any-return]
+
+
+def export(source: Path, out: Path, part: Part | None = None) -> list[str]:
+    """Exports a directory's tokenizer or transformer to a safetensors file. Errors as in :func:`convert`.
+
+    Args:
+        part: the part to export; None: the only one.
+    """
     replaces = check_file(out)
     parts = [p for p in PARTS if saved_part(source, IVideoGPTConfig, p)]
     if part not in parts and len(parts) != 1:
@@ -198,7 +222,7 @@ def _export(source: Path, out: Path, part: Part | None) -> str:
         entries = llama_table(model)
     tensors = to_tensors(load_weights(source / part / "weights", shapes), entries)
     write_safetensors(out, tensors, {METADATA: json.dumps({"model": to_dict(model), "inputs": inputs._asdict()})})
-    return f"{out}: {len(tensors)} tensors of iVideoGPT's {part}, under their public names{replaces}"
+    return [f"{out}: {len(tensors)} tensors of iVideoGPT's {part}, under their public names{replaces}"]
 
 
 def _exported(source: Path, metadata: dict[str, str]) -> tuple[IVideoGPTConfig, Inputs] | None:

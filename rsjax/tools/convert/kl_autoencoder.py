@@ -26,10 +26,10 @@ from rsjax.tools.convert.files import (
     check_type,
     left_aside,
     published_settings,
-    read_tensors,
     setting,
     write_published,
 )
+from rsjax.tools.convert.sources import read_network, weights_files
 from rsjax.tools.convert.table import SAME_NAMES, Names, Table, shape_of, to_params, to_tensors, vae_table
 from rsjax.trainable import Params
 
@@ -152,18 +152,16 @@ def to_public(config: KLConfig, params: Params) -> tuple[Tensors, dict[str, Any]
 
 
 def convert(source: Path, out: Path) -> list[str]:
-    """Imports SDXL's autoencoder into a directory, or exports a directory's autoencoder to a safetensors file.
+    """Imports SDXL's autoencoder into a directory.
+
+    Args:
+        source: the file, its directory, or that of a pipeline whose folder ``vae`` holds it.
 
     Raises:
         UserError: the source cannot be read or does not fit, or ``out`` cannot be written.
     """
-    if source.is_dir():
-        replaces = check_file(out)
-        tensors, settings = to_public(*load_kl_autoencoder(source))
-        write_published(out, tensors, settings)
-        text = f"under their public names; settings in {SETTINGS}{replaces}"
-        return [f"{out}: {len(tensors)} tensors of an autoencoder, {text}"]
-    tensors, _, names, others, _ = read_tensors(source)
+    (source,) = weights_files(source, {"tokenizer": "vae"}, None)
+    tensors, _, names, others, _ = read_network(source)
     settings = published_settings(source, CLASS)
     config, params = from_public(source, tensors, settings, names)
     replaces = REPLACES * save(out, config, params)
@@ -172,3 +170,12 @@ def convert(source: Path, out: Path) -> list[str]:
         known = SDXL_FACTOR
         lines.append(f"no scaling_factor in a {SETTINGS} beside {source.name}: SDXL's {known} is taken")
     return lines
+
+
+def export(source: Path, out: Path) -> list[str]:
+    """Exports a directory's autoencoder to a safetensors file. Errors as in :func:`convert`."""
+    replaces = check_file(out)
+    tensors, settings = to_public(*load_kl_autoencoder(source))
+    write_published(out, tensors, settings)
+    text = f"under their public names; settings in {SETTINGS}{replaces}"
+    return [f"{out}: {len(tensors)} tensors of an autoencoder, {text}"]

@@ -14,9 +14,9 @@ from rsjax.tools.convert.files import (
     Tensors,
     check_file,
     left_aside,
-    read_tensors,
     write_safetensors,
 )
+from rsjax.tools.convert.sources import read_network, weights_file
 from rsjax.tools.convert.table import SAME_NAMES, Names, check
 
 _WITHIN = r"(?:loss\.perceptual_loss\.)?"  # the prefix in a tokenizer's checkpoint
@@ -77,8 +77,8 @@ def convert(sources: list[Path], out: Path) -> list[str]:
     merged: Tensors = {}
     names: dict[str, str] = {}
     aside = 0
-    for source in sources:
-        tensors, _, own, others, _ = read_tensors(source)
+    for source in map(weights_file, sources):
+        tensors, _, own, others, _ = read_network(source)
         if twice := merged.keys() & tensors.keys():
             raise ConvertError(f"{source}: {own[min(twice)]} is also in an earlier file; pass each part once")
         merged |= tensors

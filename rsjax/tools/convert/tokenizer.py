@@ -21,9 +21,9 @@ from rsjax.tools.convert.files import (
     check_file,
     exported_config,
     left_aside,
-    read_tensors,
     write_safetensors,
 )
+from rsjax.tools.convert.sources import read_network, weights_file
 from rsjax.tools.convert.table import (
     SAME_NAMES,
     Entry,
@@ -183,20 +183,24 @@ def from_public(
 
 
 def convert(source: Path, out: Path, weights: Weights) -> list[str]:
-    """Imports a public tokenizer into a directory, or exports a directory's tokenizer to a safetensors file.
+    """Imports a public tokenizer into a directory.
 
     Raises:
         UserError: the source cannot be read or does not fit, or ``out`` cannot be written.
     """
-    if source.is_dir():
-        replaces = check_file(out)
-        config, params = load_tokenizer(source)
-        tensors = to_tensors(params, table(config))
-        write_safetensors(out, tensors, {METADATA: json.dumps(to_dict(config))})
-        return [f"{out}: {len(tensors)} tensors of a tokenizer, under their public names{replaces}"]
-    tensors, metadata, names, others, _ = read_tensors(source)
+    source = weights_file(source)
+    tensors, metadata, names, others, _ = read_network(source)
     own = exported_config(TokenizerConfig, source, metadata, METADATA)
     config, params, aside = from_public(source, tensors, weights, own, names)
     replaces = REPLACES * save(out, config, params)
     used = len(tensors) - aside.total()
     return [f"{out}: a tokenizer of {used} {weights} tensors, {config}{replaces}", *left_aside(aside, others)]
+
+
+def export(source: Path, out: Path) -> list[str]:
+    """Exports a directory's tokenizer to a safetensors file. Errors as in :func:`convert`."""
+    replaces = check_file(out)
+    config, params = load_tokenizer(source)
+    tensors = to_tensors(params, table(config))
+    write_safetensors(out, tensors, {METADATA: json.dumps(to_dict(config))})
+    return [f"{out}: {len(tensors)} tensors of a tokenizer, under their public names{replaces}"]

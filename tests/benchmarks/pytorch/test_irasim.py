@@ -8,7 +8,7 @@ import pytest
 
 from rsjax.models.irasim.dit import DiT
 from rsjax.tools.bench.run import bench
-from rsjax.tools.convert.irasim import from_public
+from rsjax.tools.convert.irasim import Variant, from_public
 from tests.benchmarks.pytorch.eager import EAGER
 from tests.models.irasim import public, toy
 
@@ -22,7 +22,7 @@ def test_output_is_that_of_the_network(video: bool) -> None:
 
     net = public.Network(video=video)
     tensors = public.random_weights(net)
-    config, params, _ = from_public("file", tensors, heads=net.heads)
+    config, params, _ = from_public("file", tensors, variant=Variant(net.heads, "video" if video else None))
     reference = IRASimTorch(replace(config, rows=net.grid[0] * net.patch, columns=net.grid[1] * net.patch))
     reference.load_state_dict({name: torch.tensor(x) for name, x in tensors.items()})
     rng = np.random.default_rng(0)

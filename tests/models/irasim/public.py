@@ -28,6 +28,12 @@ class Network:
     actions: int = 7
     video: bool = False
     linear: bool = False  # of Language-Table: two linear layers of other names, without an activation
+    final_frame_ada: bool = False
+    learn_sigma: bool = False
+
+    @property
+    def outputs(self) -> int:
+        return self.channels * (1 + self.learn_sigma)
 
 
 def shapes(net: Network) -> dict[str, tuple[int, ...]]:
@@ -44,8 +50,11 @@ def shapes(net: Network) -> dict[str, tuple[int, ...]]:
     linear("t_embedder.mlp.0", d, 256)
     linear("t_embedder.mlp.2", d, d)
     first, second = ("embed_arm_state", "embed_state") if net.linear else ("embed_state.fc1", "embed_state.fc2")
-    linear(first, 4 * d, net.actions * (net.frames - 1 if net.video else 1))
+    linear(first, 4 * d, net.actions * (net.frames - 1 if net.video and not net.linear else 1))
     linear(second, d, 4 * d)
+    if net.video and net.linear:
+        linear("mlp.fc1", (net.frames - 1) * d, (net.frames - 1) * d)
+        linear("mlp.fc2", d, (net.frames - 1) * d)
     out["mask_emb_fn.weight"] = (1, d)
     for i in range(net.depth):
         linear(f"blocks.{i}.attn.qkv", 3 * d, d)
@@ -53,7 +62,7 @@ def shapes(net: Network) -> dict[str, tuple[int, ...]]:
         linear(f"blocks.{i}.mlp.fc1", 4 * d, d)
         linear(f"blocks.{i}.mlp.fc2", d, 4 * d)
         linear(f"blocks.{i}.adaLN_modulation.1", 6 * d, d)
-    linear("final_layer.linear", net.patch**2 * net.channels, d)
+    linear("final_layer.linear", net.patch**2 * net.outputs, d)
     linear("final_layer.adaLN_modulation.1", 2 * d, d)
     return out
 
@@ -72,7 +81,7 @@ def random_weights(net: Network, seed: int = 0) -> Tensors:
 def waves(at: np.ndarray, width: int) -> np.ndarray:
     rows = []
     for position in at:
-        angles = [position / 10_000 ** (2 * i / width) for i in range(width // 2)]
+        angles = [position * (1.0 / 10_000 ** (i / (width / 2.0))) for i in range(width // 2)]
         rows.append([math.sin(a) for a in angles] + [math.cos(a) for a in angles])
     return np.array(rows)
 
@@ -112,8 +121,10 @@ def forward(
     time = linear("t_embedder.mlp.2", silu(time))
 
     first, second = ("embed_arm_state", "embed_state") if net.linear else ("embed_state.fc1", "embed_state.fc2")
-    known = linear(first, actions.reshape(batch, 1, -1) if net.video else actions)
+    known = linear(first, actions.reshape(batch, 1, -1) if net.video and not net.linear else actions)
     known = linear(second, known if net.linear else gelu(known))
+    if net.video and net.linear:
+        known = linear("mlp.fc2", gelu(linear("mlp.fc1", known.reshape(batch, 1, -1))))
     unknown = w["mask_emb_fn.weight"]
     if not net.video:
         known = np.concatenate([np.broadcast_to(unknown, (batch, 1, d)), known], 1)
@@ -148,14 +159,16 @@ def forward(
             tokens = block(f"blocks.{i}", flat, np.repeat(plain[:, 0], cells, 0))
             tokens = tokens.reshape(batch, cells, frames, d).swapaxes(1, 2)
 
-    shift, scale = np.split(linear("final_layer.adaLN_modulation.1", silu(plain))[:, :, None], 2, -1)
+    shift, scale = np.split(
+        linear("final_layer.adaLN_modulation.1", silu(acted if net.final_frame_ada else plain))[:, :, None], 2, -1
+    )
     pieces = linear("final_layer.linear", norm(tokens) * (1 + scale) + shift)
-    out = np.zeros((batch, frames, net.channels, rows * p, columns * p))
+    out = np.zeros((batch, frames, net.outputs, rows * p, columns * p))
     for s in range(cells):
         i, j = divmod(s, columns)
-        piece = pieces[:, :, s].reshape(batch, frames, p, p, net.channels)
+        piece = pieces[:, :, s].reshape(batch, frames, p, p, net.outputs)
         out[..., i * p : (i + 1) * p, j * p : (j + 1) * p] = piece.transpose(0, 1, 4, 2, 3)
-    return out
+    return out[:, :, : net.channels]  # the others are variances
 
 
 def norm(x: np.ndarray) -> np.ndarray:

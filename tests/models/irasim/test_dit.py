@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from rsjax.models.irasim.dit import Architecture, DiT
-from rsjax.tools.convert.irasim import from_public, to_public
+from rsjax.tools.convert.irasim import Variant, from_public, to_public
 from tests.models.irasim import public
 
 RNG = np.random.default_rng(1)
@@ -20,6 +20,8 @@ VARIANTS = {
     "frame": public.Network(),
     "video": public.Network(video=True),
     "linear": public.Network(linear=True, actions=2),
+    "linear video": public.Network(linear=True, video=True, actions=2),
+    "whole": public.Network(final_frame_ada=True, learn_sigma=True),
 }
 
 
@@ -36,10 +38,15 @@ def rows_of(actions: np.ndarray) -> np.ndarray:
     return np.concatenate([np.full_like(actions[:, :1], 1e3), actions], axis=1)
 
 
+def variant_of(net: public.Network) -> Variant:
+    """What a user tells of a network whose tensors do not reveal it."""
+    return Variant(net.heads, "video" if net.video and not net.linear else None, net.final_frame_ada)
+
+
 @cache
 def model(variant: str) -> tuple[Architecture, Any]:
     net = VARIANTS[variant]
-    config, params, aside = from_public("file", public.random_weights(net), heads=net.heads)
+    config, params, aside = from_public("file", public.random_weights(net), variant=variant_of(net))
     assert aside == 2
     return config, params
 
@@ -63,7 +70,16 @@ def test_export_returns_the_public_file(variant: str) -> None:
     exported = to_public(*model(variant))
     assert exported.keys() == tensors.keys()
     for name, x in tensors.items():
-        np.testing.assert_allclose(exported[name], x, atol=1e-7, err_msg=name)
+        assert exported[name].tobytes() == x.tobytes(), name
+
+
+@pytest.mark.parametrize("grid", [(3, 8), (8, 3), (2, 12), (1, 24), (18, 32)])
+def test_the_files_positions_identify_its_grid(grid: tuple[int, int]) -> None:
+    net = public.Network(depth=2, grid=grid)
+    config, params, _ = from_public("file", public.random_weights(net), variant=variant_of(net))
+    assert config.grid == grid
+    exported = to_public(config, params)
+    assert exported["pos_embed"].tobytes() == public.random_weights(net)["pos_embed"].tobytes()
 
 
 @pytest.mark.usefixtures("bf16_units")

@@ -70,11 +70,11 @@ def test_both_networks_come_back_to_the_bit(tmp_path: Path, capsys: pytest.Captu
         ("tokenizer", vae, settings),
     ):
         (tmp_path / part).mkdir()
-        convert("cogvideox", tmp_path / "own", tmp_path / part / "x.safetensors", "--part", part)
+        convert("cogvideox", "--export", tmp_path / "own", tmp_path / part / "x.safetensors", "--part", part)
         assert_same(tmp_path / part / "x.safetensors", expected)
         assert json.loads((tmp_path / part / "config.json").read_text()) == beside
     assert "holds tokenizer and world_model; name one with --part" in refused(
-        capsys, "cogvideox", tmp_path / "own", tmp_path / "x.safetensors"
+        capsys, "cogvideox", "--export", tmp_path / "own", tmp_path / "x.safetensors"
     )
 
     # A model without learned positions starts from it, and one with others does not.

@@ -52,7 +52,7 @@ def test_import_and_export_are_inverse_to_the_bit(kind: str, tmp_path: Path) -> 
     tensors, load = kinds[kind]
     write_safetensors(tmp_path / "in.safetensors", tensors, {})
     convert(kind, tmp_path / "in.safetensors", tmp_path / "own", *(["--heads", 2] if kind == "genie" else []))
-    convert(kind, tmp_path / "own", tmp_path / "out" / "x.safetensors")
+    convert(kind, "--export", tmp_path / "own", tmp_path / "out" / "x.safetensors")
     assert_same(tmp_path / "out" / "x.safetensors", tensors)
     convert(kind, tmp_path / "out" / "x.safetensors", tmp_path / "again")
     (config, params), (config_again, params_again) = (load(tmp_path / d) for d in ("own", "again"))
@@ -74,7 +74,7 @@ def test_an_exported_tokenizer_carries_its_configuration(tmp_path: Path) -> None
     config, params = load_tokenizer(tmp_path / "own")
     other = replace(config, norm_groups=8, depth_scale="linear")
     save(tmp_path / "other", other, params)
-    convert("tokenizer", tmp_path / "other", tmp_path / "x.safetensors")
+    convert("tokenizer", "--export", tmp_path / "other", tmp_path / "x.safetensors")
     convert("tokenizer", tmp_path / "x.safetensors", tmp_path / "again")
     assert load_tokenizer(tmp_path / "again")[0] == other
 
@@ -109,7 +109,7 @@ def test_replacing_an_output_is_said(tmp_path: Path, capsys: pytest.CaptureFixtu
     write_safetensors(tmp_path / "in.safetensors", GENIE, {})
     for expected in (False, True):
         convert("genie", tmp_path / "in.safetensors", tmp_path / "own", "--heads", 2)
-        convert("genie", tmp_path / "own", tmp_path / "out" / "x.safetensors")
+        convert("genie", "--export", tmp_path / "own", tmp_path / "out" / "x.safetensors")
         convert("tokenizer", _written(tmp_path / "t.safetensors", TOKENIZER), tmp_path / "own")
         assert capsys.readouterr().out.count("it replaces the one that was there") == 3 * expected
 
@@ -123,7 +123,7 @@ def test_an_export_that_stops_leaves_no_settings(tmp_path: Path, monkeypatch: py
     monkeypatch.setattr(files, "write_safetensors", stop)
     monkeypatch.setattr("rsjax.command.exit_now", sys.exit)  # which would end the tests
     with pytest.raises(SystemExit) as stopped:
-        convert("genie", tmp_path / "own", tmp_path / "out" / "x.safetensors")
+        convert("genie", "--export", tmp_path / "own", tmp_path / "out" / "x.safetensors")
     assert stopped.value.code == 130
     assert not (tmp_path / "out" / "config.json").exists()
 
@@ -148,12 +148,16 @@ def test_errors_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert "no such file" in refused(capsys, "tokenizer", tmp_path / "none.ckpt", tmp_path / "own")
     assert "--heads" in refused(capsys, "genie", tmp_path / "in.safetensors", tmp_path / "own")
     convert("genie", tmp_path / "in.safetensors", tmp_path / "own", "--heads", 2)
-    assert ".safetensors" in refused(capsys, "genie", tmp_path / "own", tmp_path / "other")
-    assert "holds no tokenizer/weights" in refused(capsys, "tokenizer", tmp_path / "own", tmp_path / "x.safetensors")
-    assert "settings" in refused(capsys, "genie", tmp_path / "own", tmp_path / "own" / "x.safetensors")
+    assert ".safetensors" in refused(capsys, "genie", "--export", tmp_path / "own", tmp_path / "other")
+    assert "holds no tokenizer/weights" in refused(
+        capsys, "tokenizer", "--export", tmp_path / "own", tmp_path / "x.safetensors"
+    )
+    assert "settings" in refused(capsys, "genie", "--export", tmp_path / "own", tmp_path / "own" / "x.safetensors")
     (tmp_path / "x" / "config.json").mkdir(parents=True)
-    assert "config.json: cannot be read" in refused(capsys, "genie", tmp_path / "own", tmp_path / "x" / "x.safetensors")
-    assert "is a directory" in refused(capsys, "lpips", tmp_path / "own", tmp_path / "x.safetensors")
+    assert "config.json: cannot be read" in refused(
+        capsys, "genie", "--export", tmp_path / "own", tmp_path / "x" / "x.safetensors"
+    )
+    assert "holds networks of this project" in refused(capsys, "lpips", tmp_path / "own", tmp_path / "x.safetensors")
     assert "is a pipe or device" in refused(capsys, "lpips", "/dev/zero", tmp_path / "x.safetensors")
     run = tmp_path / "run"
     run.mkdir()

@@ -43,7 +43,7 @@ def test_irasim_comes_back_to_the_bit(weights: Path, capsys: pytest.CaptureFixtu
     folder = weights.parent
     convert("irasim", weights, folder / "own", "--heads", NET.heads)
     assert "left aside: 2 tensors of fixed positions" in capsys.readouterr().out
-    convert("irasim", folder / "own", folder / "out.safetensors")
+    convert("irasim", "--export", folder / "own", folder / "out.safetensors")
     expected = public.random_weights(NET)
     assert_same(folder / "out.safetensors", expected)
     convert("irasim", folder / "out.safetensors", folder / "again")
@@ -61,7 +61,7 @@ def test_sdxl_comes_back_to_the_bit_with_its_factor(vae: Path, capsys: pytest.Ca
     assert config == SMALL
     np.testing.assert_allclose(np.exp(-params["latents"]["log_deviation"]), 0.2, rtol=1e-5)
     (vae.parent / "out").mkdir()
-    convert("sdxl", vae.parent / "own", vae.parent / "out" / "x.safetensors")
+    convert("sdxl", "--export", vae.parent / "own", vae.parent / "out" / "x.safetensors")
     assert json.loads((vae.parent / "out" / "config.json").read_text())["scaling_factor"] == 0.2
 
 
@@ -105,6 +105,30 @@ def test_files_of_something_else_are_refused(
     assert "missing: blocks.1.mlp.fc2.bias; unexpected: extra" in message
     (vae.parent / "config.json").write_text('{"_class_name": "AutoencoderTiny"}')
     assert "describes AutoencoderTiny, not AutoencoderKL" in refused(capsys, "sdxl", vae, tmp_path / "o")
+
+
+def test_what_the_tensors_do_not_reveal_is_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def file(net: public.Network, **changes: np.ndarray) -> Path:
+        write_safetensors(tmp_path / "x.safetensors", public.random_weights(net) | changes, {})
+        return tmp_path / "x.safetensors"
+
+    # 6 numbers and 4 frames: an action of 6 numbers, or 3 actions of 2.
+    path = file(public.Network(depth=2, frames=4, actions=6))
+    both = refused(capsys, "irasim", path, tmp_path / "o", "--heads", 2)
+    assert "reads 6 numbers, which are one action or those of all 3 in a clip; set --conditioning frame or" in both
+    for conditioning, inputs in (("frame", 6), ("video", 2)):
+        convert("irasim", path, tmp_path / conditioning, "--heads", 2, "--conditioning", conditioning)
+        made = load_irasim(tmp_path / conditioning)[0]
+        assert (made.conditioning, made.action_inputs) == (conditioning, inputs)
+    path = file(public.Network(depth=2, frames=4, actions=7))
+    said = refused(capsys, "irasim", path, tmp_path / "o", "--heads", 2, "--conditioning", "video")
+    assert "reads 7 numbers, which the 3 actions of a clip do not divide" in said
+    convert("irasim", path, tmp_path / "whole", "--heads", 2, "--final-frame-ada")
+    assert load_irasim(tmp_path / "whole")[0].final_frame_ada
+    for name in ("pos_embed", "temp_embed"):
+        shape = public.shapes(NET)[name]
+        path = file(NET, **{name: np.ones(shape, np.float32)})
+        assert f"{name} holds no sines and cosines" in refused(capsys, "irasim", path, tmp_path / "o", "--heads", 2)
 
 
 def test_a_trained_autoencoder_has_no_public_form(tmp_path: Path) -> None:

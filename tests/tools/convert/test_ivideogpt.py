@@ -62,11 +62,13 @@ def test_one_directory_holds_both_parts_and_exports_each_to_the_bit(
     assert settings["inputs"] == {"image_size": 16, "action_dim": 3}
     for part, tensors in (("tokenizer", TOKENIZER), ("world_model", TRANSFORMER)):
         out = tmp_path / "out" / f"{part}.safetensors"
-        convert("ivideogpt", tmp_path / "own", out, "--part", part)
+        convert("ivideogpt", "--export", tmp_path / "own", out, "--part", part)
         assert_same(out, tensors)
         convert("ivideogpt", out, tmp_path / "again")
     assert json.loads((tmp_path / "again" / "config.json").read_text()) == settings
-    assert "name one with --part" in refused(capsys, "ivideogpt", tmp_path / "own", tmp_path / "x.safetensors")
+    assert "name one with --part" in refused(
+        capsys, "ivideogpt", "--export", tmp_path / "own", tmp_path / "x.safetensors"
+    )
 
 
 def test_weights_without_actions_start_a_model_with_actions_that_changes_nothing(tmp_path: Path) -> None:
@@ -91,7 +93,7 @@ def test_a_model_without_actions_of_clips_that_have_some_comes_back(tmp_path: Pa
     shapes = jax.eval_shape(LLaMA(Architecture.create(alone, CLIPS)).init_params, jax.random.key(0))
     params = to_params("", llama_tensors(alone), llama_table(alone), shapes)
     save_part(tmp_path / "own", "world_model", alone, Inputs(CLIPS.image_size, CLIPS.action_dim), params)
-    convert("ivideogpt", tmp_path / "own", tmp_path / "out.safetensors")
+    convert("ivideogpt", "--export", tmp_path / "own", tmp_path / "out.safetensors")
     convert("ivideogpt", tmp_path / "out.safetensors", tmp_path / "again")
     old, new = (json.loads((tmp_path / name / "config.json").read_text()) for name in ("own", "again"))
     assert new["inputs"] == old["inputs"] and new["model"]["use_actions"] is False
