@@ -52,7 +52,7 @@ WANTED = {
 }
 
 
-@pytest.mark.parametrize("preset", ["roboscape_s", "tiny"])
+@pytest.mark.parametrize("preset", ["roboscape_s", "roboscape_tiny"])
 @pytest.mark.parametrize("kind", ["adamw", "muon"])
 def test_moments_and_averages_lie_as_their_parameter(preset: str, kind: str) -> None:
     found = world_model(preset, kind)
@@ -67,7 +67,7 @@ def test_moments_and_averages_lie_as_their_parameter(preset: str, kind: str) -> 
     assert followers == len(params) + moments, "an average, and two moments each, of which Muon keeps one of a matrix"
 
 
-@pytest.mark.parametrize("preset", ["roboscape_s", "tiny"])
+@pytest.mark.parametrize("preset", ["roboscape_s", "roboscape_tiny"])
 def test_nearly_all_of_a_state_is_cut(preset: str) -> None:
     found = list(world_model(preset).values())
     assert cut_elements(found) / sum(prod(row.shape) for row in found) > 0.97
