@@ -45,6 +45,8 @@ class Options:
     """Evaluate again even if a result is up to date."""
     second_takes: bool = False
     """Simulate the scored clips once more with slightly jittered actions, for physics_iq_score."""
+    as_published: bool = False
+    """Pass the masks of Physics-IQ through a lossy video, as its public code does, for comparison with its numbers."""
     prompt_frames: int | None = None
     """Recorded frames that generation starts from. This and the following options change the protocol."""
     horizon: int | None = None
@@ -91,6 +93,8 @@ def main() -> None:
     from rsjax.tools.pipeline.evaluations import Request, evaluate_run
 
     changes = {name: value for name in CHANGES if (value := getattr(options, name)) is not None}
+    if options.as_published:
+        changes["as_published"] = True
     settings = {name: value for name, value in vars(options.eval).items() if value is not None}
     where = (options.data, options.split, options.store, options.overwrite, options.second_takes)
     request = Request(options.protocol, changes, settings, *where)

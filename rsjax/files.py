@@ -9,6 +9,7 @@ import shutil
 import socket
 import stat
 import time
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -20,6 +21,9 @@ from rsjax.errors import UserError, storage_limit
 from rsjax.progress import note
 
 _HEAD = 512  # bytes at a file's start by which placeholders are recognised
+SEAL = "crc32"  # the field of a sealed JSON object that has its checksum
+LONGEST_PATH = 4095  # bytes, on Linux
+LONGEST_NAME = 255
 LOCK_SECONDS = 0.25  # for this long a free lock may look taken, while other processes check it
 
 
@@ -50,16 +54,44 @@ def read_json(path: Path, kind: type = dict, cure: str = "restore it, or delete 
         cure: what to do about a file that is missing or damaged.
 
     Raises:
-        FileError: the file is missing, cannot be read, is not JSON in UTF-8, or holds another type.
+        FileError: the file is missing, cannot be read, is not JSON in UTF-8, holds another type, or is sealed
+            (:func:`write_json`) and was changed.
     """
     try:
-        return parse_json(regular(path).read_bytes(), kind)
+        content = parse_json(regular(path).read_bytes(), kind)
+        if kind is dict and type(content.get(SEAL)) is int and content.pop(SEAL) != _seal(content):
+            raise ValueError("its checksum is wrong")
+        return content
     except (FileNotFoundError, NotADirectoryError) as error:
         raise FileError(f"{path}: missing; {cure}") from error
     except OSError as error:
         raise FileError(f"{path}: cannot be read ({error.strerror}); mend the link or permission") from error
     except ValueError as error:
         raise FileError(f"{path}: {placeholder(path) or f'{error}; {cure}'}") from error
+
+
+def checked_path(path: object, what: str) -> Path:
+    """Returns a path that a caller of the public interface gave.
+
+    Args:
+        what: the argument, for error messages.
+
+    Raises:
+        FileError: it is no path, is empty, or has characters or a length that no file name has.
+    """
+    if not isinstance(path, str | os.PathLike):
+        raise FileError(f"{what} is {path!r:.80}; give a path, such as 'runs/tiny'")
+    try:
+        text = os.fspath(path)
+        coded = os.fsencode(text)
+    except UnicodeError as error:
+        raise FileError(f"{what} is {path!r:.80}; it has characters that no file name has") from error
+    if not coded or b"\0" in coded or len(coded) > LONGEST_PATH or max(map(len, coded.split(b"/"))) > LONGEST_NAME:
+        raise FileError(
+            f"{what} is {path!r:.80}; a path has up to {LONGEST_PATH} bytes, none of them zero, and a name in it up to "
+            f"{LONGEST_NAME}"
+        )
+    return Path(os.fsdecode(coded))
 
 
 def regular(path: Path) -> Path:
@@ -116,7 +148,7 @@ def content_hash(path: Path, pattern: str = "*") -> str:
     """
 
     def hashed(file: Path) -> str:
-        with file.open("rb") as content:
+        with regular(file).open("rb") as content:
             return hashlib.file_digest(content, "sha256").hexdigest()
 
     try:
@@ -189,9 +221,20 @@ def write_file(path: Path, payload: bytes) -> None:
         write_atomically(path, payload)
 
 
-def write_json(path: Path, content: Any) -> None:
-    """Writes a JSON file as :func:`write_file` does."""
+def write_json(path: Path, content: Any, sealed: bool = False) -> None:
+    """Writes a JSON file as :func:`write_file` does.
+
+    Args:
+        sealed: whether to add a checksum to the object, which :func:`read_json` compares: for numbers that nobody is
+            to edit, where a flipped bit could give another number.
+    """
+    if sealed:
+        content = {**content, SEAL: _seal(content)}
     write_file(path, json.dumps(content, indent=1).encode())
+
+
+def _seal(content: dict[str, Any]) -> int:
+    return zlib.crc32(json.dumps(content).encode())
 
 
 @contextmanager
@@ -269,6 +312,7 @@ def making(path: Path, wait: bool) -> Iterator[None]:
 
 def lock_file(path: Path) -> Path:
     """Returns the path of the lock that :func:`making` takes."""
+    path = path.absolute()  # "." has no name of its own
     return path.with_name(f".{path.name}.lock")
 
 

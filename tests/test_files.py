@@ -1,3 +1,4 @@
+import json
 import os
 import socket
 import subprocess
@@ -11,17 +12,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import rsjax
 from rsjax.config import presets
 from rsjax.data.labels import Labels
+from rsjax.data.normalization import Normalization
 from rsjax.data.quarantine import read_quarantine
 from rsjax.data.store import open_store
 from rsjax.errors import UserError
-from rsjax.files import FileError, content_hash, holder, is_held, lock, making, placeholder, read_json
+from rsjax.files import FileError, checked_path, content_hash, holder, is_held, lock, making, placeholder, read_json
 from rsjax.tokenizers.lpips import load_lpips
 from rsjax.tools.convert.files import read_tensors
 from rsjax.tools.ingest.annotators.network import require_weights
 from rsjax.tools.ingest.doctor import select
 from rsjax.tools.pipeline.videos import Request, _foreign_actions
+from rsjax.tools.policies.judges.people_and_vlms import HumanJudge
 from rsjax.training.log import read_rows
 from tests.tools.ingest.toy import Source
 
@@ -183,3 +187,43 @@ def test_what_a_download_left_in_place_of_a_file_is_named(tmp_path: Path, name: 
 def test_data_are_no_placeholders(content: bytes) -> None:
     assert placeholder(b"\x89" + content) == placeholder(b"{" + content) == ""
     assert placeholder(b"\xef\xbb\xbf <!DOCTYPE HTML>" + content)
+
+
+def test_only_what_can_be_a_path_is_one(tmp_path: Path) -> None:
+    for path in (tmp_path, str(tmp_path), "runs/tiny", "."):
+        assert checked_path(path, "run") == Path(path)
+    for wrong in (None, 7, b"runs", "", "x" * 256, "x/" * 3000, "a\0b", "\ud800", ["runs"]):
+        for refuse in (lambda wrong=wrong: checked_path(wrong, "run"), lambda wrong=wrong: rsjax.load(wrong)):
+            with pytest.raises(FileError) as raised:
+                refuse()
+            assert str(raised.value).startswith("run is ")
+        with pytest.raises(UserError):
+            rsjax.open_store(wrong)  # type: ignore[arg-type]
+        with pytest.raises(UserError):
+            rsjax.write_store(wrong, [])  # type: ignore[arg-type]
+
+
+def test_pipes_are_refused_where_content_is_hashed_or_labels_are_read(tmp_path: Path) -> None:
+    """Opening one would wait for ever."""
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(FileError):
+        content_hash(tmp_path / "pipe")
+    with pytest.raises(UserError):
+        HumanJudge.read(tmp_path / "pipe")
+
+
+def test_a_changed_digit_of_sealed_numbers_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "normalization.json"
+    saved = Normalization((0.125, 2.0), (1.0, 0.5), (0.3, 2.5))
+    saved.save(tmp_path)
+    assert Normalization.load(tmp_path) == saved
+    whole = path.read_text()
+    for old, new in (("0.125", "0.725"), ("2.5", "2.7"), ("1.0", "1.8")):
+        path.write_text(whole.replace(old, new, 1))
+        with pytest.raises(UserError) as raised:
+            Normalization.load(tmp_path)
+        assert "its checksum is wrong" in str(raised.value)
+    values = json.loads(whole)
+    del values["crc32"]  # as files of older versions
+    path.write_text(json.dumps(values))
+    assert Normalization.load(tmp_path) == saved

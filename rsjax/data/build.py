@@ -21,7 +21,7 @@ from rsjax.data.codec import Record, encode
 from rsjax.data.normalization import Statistics
 from rsjax.data.store import MANIFEST, WRITER_OPTIONS, Source, Store, StoreError, encode_clip, open_store, write_store
 from rsjax.errors import did_you_mean
-from rsjax.files import disk_guard, making
+from rsjax.files import checked_path, disk_guard, making
 
 TRACKS = 256  # number of empty tracks of a clip without tracks
 _LABELS = ("difficulty", "scene", "segment", "skill")
@@ -40,12 +40,14 @@ class _Episode:
 
 def write_clips(path: Path | str, clips: Iterable[Mapping[str, Any] | Clip], test_share: float = 0.1) -> Store:
     """Writes a store of clips, as :func:`rsjax.write_store` documents it."""
-    path = Path(path)
-    if not 0 <= test_share < 1:
+    path = checked_path(path, "path")
+    if not isinstance(test_share, int | float) or not 0 <= test_share < 1:
         raise StoreError(f"test_share is {test_share}; it is a share of the episodes, from 0 to below 1")
     if path.exists() and not (path / MANIFEST).exists():
         raise StoreError(f"{path}: exists and is not a store; move it away or choose another place")
     episodes: dict[str, _Episode] = {}
+    if not isinstance(clips, Iterable):
+        raise StoreError(f"clips are {clips!r:.80}; give an iterable of clips")
     first: dict[str, tuple[int, ...]] = {}
     digest = hashlib.sha256()
     scored = False

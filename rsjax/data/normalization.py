@@ -3,7 +3,6 @@
 Axes: B clips, T frames, A action dimensions, N rows.
 """
 
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -15,7 +14,7 @@ from jaxtyping import Float, Float32, Float64
 
 from rsjax.data.store import MANIFEST, Store, StoreError
 from rsjax.errors import UserError
-from rsjax.files import FileError, read_json, write_atomically
+from rsjax.files import FileError, read_json, write_json
 
 FILE = "units.json"
 
@@ -66,7 +65,7 @@ class Normalization:
 
     def save(self, run: Path) -> None:
         """Writes what :meth:`load` reads."""
-        write_atomically(run / FILE, json.dumps(asdict(self)).encode())
+        write_json(run / FILE, asdict(self), sealed=True)
 
     @classmethod
     def _of(cls, values: dict[str, Any]) -> "Normalization":

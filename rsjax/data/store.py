@@ -19,7 +19,7 @@ from rsjax.clip import Clip
 from rsjax.data.codec import Record, decode, encode
 from rsjax.data.labels import Label, Labels, LabelWriter
 from rsjax.data.manifest import FORMAT, ManifestError, check_manifest
-from rsjax.files import FileError, disk_guard, placeholder, read_json, replace_directory
+from rsjax.files import FileError, checked_path, disk_guard, placeholder, read_json, replace_directory
 
 MANIFEST = "manifest.json"
 WRITER_OPTIONS = "group_size:1,zstd:1"  # one record per group: random access reads no more than it returns
@@ -168,7 +168,10 @@ def open_store(path: Path | str) -> Store:
             (permissions, a loop of links); or its manifest names a file outside the store or an impossible size. The
             message says to delete the directory only if it contains shards, so that nobody deletes their recordings.
     """
-    path = Path(path)
+    try:
+        path = checked_path(path, "path")
+    except FileError as error:
+        raise StoreError(str(error)) from error
     place = path / MANIFEST
     again = f"delete {path} and make it again"
     ours = any(path.glob("*.array_record"))

@@ -292,6 +292,7 @@ def make_scenes(
             protocol.prompt_frames,
             estimated=estimated.get(suffix),
             second_take=retakes,
+            as_published=protocol.as_published,
             settings=trained.config.eval,
             truth_cache=truth_cache,
         )

@@ -7,6 +7,7 @@ from rsjax.config import Config, require, to_dict
 from rsjax.config.fields import check_numbers, require_range
 from rsjax.errors import UserError, did_you_mean
 
+LEAST_RESOLUTION = 16
 OWN = "run"  # the protocol of a run's own configuration, which its evaluation stage uses
 # Fields that replace those of model.sample.
 SAMPLING = ("steps", "temperature", "top_k", "unmask", "mean_codes", "guidance")
@@ -31,6 +32,7 @@ class Protocol:
         teacher_forced: whether each frame is predicted from the recorded frames before it, not from generated ones.
         reference: what predictions are compared with: recorded frames, or the tokenizer's reconstruction of them.
         depth_alignment, depth_source: which depth scores the tables show.
+        as_published: whether Physics-IQ's masks go through a lossy video, as in its public code.
         splits: the splits whose clips are scored, each split separately; ``NAME*`` stands for all that start with NAME.
         origin: who evaluates in this way.
     """
@@ -53,6 +55,7 @@ class Protocol:
     reference: Literal["recorded", "reconstruction"] = "recorded"
     depth_alignment: Literal["none", "median", "affine_disparity", "l1_scale"] = "median"
     depth_source: Literal["branch", "estimator"] = "branch"
+    as_published: bool = False
     splits: tuple[str, ...] = ("test",)
     origin: str = ""
 
@@ -69,6 +72,11 @@ class Protocol:
         }
         for name, least in low.items():
             require_range(self, f"protocol {self.name}", least, 2**31, name)
+        require(
+            self.resolution == 0 or self.resolution >= LEAST_RESOLUTION,
+            f"protocol {self.name}: resolution is {self.resolution}; frames have at least {LEAST_RESOLUTION} pixels "
+            f"per side, as metrics look at windows; 0 scores the clips' own",
+        )
         require(bool(self.splits), f"protocol {self.name}: name a split, such as test")
 
     @property
@@ -87,7 +95,10 @@ class Protocol:
             "scores": "predicted frames",
             "best of samples": "all frames, the prompt as the model sees it included",
         }
-        return to_dict(self) | {"frames": frames if self.samples > 1 else {"scores": frames["scores"]}}
+        described = to_dict(self) | {"frames": frames if self.samples > 1 else {"scores": frames["scores"]}}
+        if not self.as_published:
+            del described["as_published"]  # which older results lack
+        return described
 
 
 PAPER = Protocol(

@@ -158,6 +158,7 @@ class Scene:
         familiarity: how far the recorded clips are from the training clips; None: not measured, or a baseline.
         second_take: the same scenes recorded once more (same start, same task), for Physics-IQ's score.
         probed: grasps at set offsets and free drives, or why there are none.
+        as_published: whether Physics-IQ's masks go through a lossy video, as in its public code.
         settings: the settings of the evaluation, with the paths of weights.
         truth_cache: what :meth:`of_truth` has computed; scenes with the same truth share it.
     """
@@ -172,6 +173,7 @@ class Scene:
     familiarity: Familiarity | None = None
     second_take: Video | None = None
     probed: Probed | Unavailable = NO_PROBES
+    as_published: bool = False
     settings: EvalConfig = field(default_factory=EvalConfig)
     truth_cache: dict[Any, Any] = field(default_factory=dict, repr=False)
     _shared: dict[Any, Any] = field(default_factory=dict, init=False, repr=False)

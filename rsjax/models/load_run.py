@@ -7,7 +7,7 @@ import jax
 from rsjax.config import Config, ConfigError, from_dict
 from rsjax.data.normalization import Normalization
 from rsjax.errors import UserError
-from rsjax.files import read_json
+from rsjax.files import checked_path, read_json
 from rsjax.models.base import Assets, create_autoencoder, create_model
 from rsjax.models.trained import TrainedModel
 from rsjax.trainable import Params
@@ -20,7 +20,7 @@ def load(run: Path | str) -> TrainedModel:
     Raises:
         UserError: the run is missing, unfinished or damaged, or was made by another version of rsjax.
     """
-    run = Path(run)
+    run = checked_path(run, "run")
     config = load_config(run)
     model = create_model(config)
     params = load_weights(run / "world_model" / "weights", jax.eval_shape(model.init, jax.random.key(0)))

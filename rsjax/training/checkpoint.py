@@ -1,6 +1,6 @@
 """Checkpoints: the whole training state with its position in the data, and the final weights that later stages read.
 
-Sizes and checksums of a checkpoint's files are kept in it, so that a damaged one is found before it is restored.
+Sizes and checksums of their files are kept in them, so that damage is found before anything is read.
 """
 
 import errno
@@ -226,11 +226,12 @@ def save_weights(path: Path, weights: PyTree) -> None:
         _need_space(path.parent, weights)
         with _checkpointer() as checkpointer:
             checkpointer.save(new, _writable(weights), force=True)
+        write_checksums(new, None, "**/*")
         replace_directory(new, path.absolute())
 
 
 def load_weights(path: Path, like: Tree) -> Tree:
-    """Reads parameters that :func:`save_weights` wrote.
+    """Reads parameters that :func:`save_weights` wrote; those of older versions have no checksums to compare.
 
     Args:
         like: parameters of the same structure, or their shapes.
@@ -240,6 +241,11 @@ def load_weights(path: Path, like: Tree) -> Tree:
     """
     if not path.exists():
         raise CheckpointError(f"{path}: no such weights; train first (python -m experiments.train)")
+    if (path / CHECKSUMS).exists() and (fault := find_fault(path)):
+        raise _pointer(path) or CheckpointError(
+            f"{path}: is damaged ({fault}); restore it from a copy, or delete it and make it again: a training makes "
+            f"it from its last checkpoint"
+        )
     try:
         _check_shapes(path, like)
         with _checkpointer() as checkpointer:
@@ -298,24 +304,32 @@ def _flat_shapes(tree: PyTree) -> dict[str, tuple[int, ...]]:
     return {".".join(map(str, path)): tuple(leaf.shape) for path, leaf in leaves.items() if hasattr(leaf, "shape")}
 
 
-def _misfit(path: Path, error: Exception) -> CheckpointError:
+def _pointer(path: Path) -> CheckpointError | None:
+    """Returns the error for the first file of a folder in whose place something else stands, such as a pointer."""
     for file in sorted(path.rglob("*")):
         if instead := placeholder(file):
             return CheckpointError(f"{file}: {instead}")
-    return CheckpointError(
+    return None
+
+
+def _misfit(path: Path, error: Exception) -> CheckpointError:
+    return _pointer(path) or CheckpointError(
         f"{path}: does not fit this configuration or is damaged ({first_line(error)}); use the configuration it was "
         f"made with, or another run directory, or delete it"
     )
 
 
-def write_checksums(checkpoint: Path, metric: float | None) -> None:
-    """Reads all files of a finished checkpoint and writes their sizes and checksums, and the checkpoint's metric.
+def write_checksums(checkpoint: Path, metric: float | None, pattern: str = "*/**/*") -> None:
+    """Reads the files of a finished checkpoint and writes their sizes and checksums, and the checkpoint's metric.
+
+    Args:
+        pattern: of the files. Those of a checkpoint are in folders: at the top are orbax's own notes, which it changes
+            later and which no restore reads.
 
     Raises:
         OSError: a file cannot be read or written.
     """
-    # Only files in folders: at the top are orbax's own notes, which it changes later and which no restore reads.
-    paths = sorted(path for path in checkpoint.glob("*/**/*") if path.is_file())
+    paths = sorted(path for path in checkpoint.glob(pattern) if path.is_file())
     files = {str(path.relative_to(checkpoint)): _size_and_checksum(path) for path in paths}
     content = {"metric": metric, "files": files}
     (checkpoint / CHECKSUMS).write_text(json.dumps(content | {"crc32": _checksum(content)}))

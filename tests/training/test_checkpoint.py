@@ -122,6 +122,28 @@ def test_weights_stay_until_those_that_replace_them_are_whole(tmp_path: Path, mo
     assert [path.name for path in tmp_path.iterdir()] == ["weights"]
 
 
+def test_a_flipped_bit_in_weights_is_refused_wherever_it_is(tmp_path: Path) -> None:
+    path = tmp_path / "weights"
+    weights = Regression().init(jax.random.key(0))
+    save_weights(path, weights)
+    rng = np.random.default_rng(0)
+    files = sorted(file for file in path.rglob("*") if file.is_file())
+    assert any(file.name == module.CHECKSUMS for file in files)
+    for file in files:
+        content = file.read_bytes()
+        for place in rng.integers(0, 8 * len(content), 3 if content else 0).tolist():
+            flipped = bytearray(content)
+            flipped[place // 8] ^= 1 << place % 8
+            file.write_bytes(bytes(flipped))
+            with pytest.raises(CheckpointError) as raised:
+                load_weights(path, weights)
+            assert str(raised.value).startswith(f"{path}: is damaged (")
+        file.write_bytes(content)
+    load_weights(path, weights)
+    (path / module.CHECKSUMS).unlink()  # as those of older versions
+    jax.tree.map(np.testing.assert_array_equal, load_weights(path, weights), weights)
+
+
 def test_weights_that_are_missing_other_or_damaged_are_named(tmp_path: Path) -> None:
     path, like = tmp_path / "weights", Regression().init(jax.random.key(0))
 

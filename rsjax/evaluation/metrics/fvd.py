@@ -8,6 +8,7 @@ compare only values where both are equal.
 
 from functools import lru_cache
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from jaxtyping import Float, UInt8
 from rsjax.config import EvalConfig
 from rsjax.errors import UserError, first_line
 from rsjax.evaluation.registry import Scene, Scores, Unavailable, metric
+from rsjax.files import content_hash
 from rsjax.progress import Progress
 
 FILE = "i3d_torchscript.pt"  # in the directory eval.weights
@@ -54,11 +56,12 @@ def check_i3d(settings: EvalConfig) -> None:
     """
     path = settings.weights_file(FILE)
     if path and find_spec("torch"):
-        _load(path)
+        _load(path, content_hash(Path(path)))
 
 
 @lru_cache(maxsize=1)
-def _load(path: str) -> Any:
+def _load(path: str, content: str) -> Any:
+    """Loads the network; ``content``, the file's hash, makes the cache read another file under the same path."""
     import torch
 
     try:
@@ -82,7 +85,7 @@ def _features(scene: Scene, videos: UInt8[np.ndarray, "B T H W 3"]) -> Float[np.
     import torch
 
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    network = _load(path).to(device)
+    network = _load(path, content_hash(Path(path))).to(device)
     parts = []
     frames = np.moveaxis(videos[:, scene.prompt_frames :], -1, 1)
     with Progress("FVD", len(frames), "videos") as progress, torch.no_grad():

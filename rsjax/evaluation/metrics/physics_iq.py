@@ -8,6 +8,7 @@ Axes: B clips, T frames, H×W pixels, h×w a quarter of them.
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from tempfile import TemporaryDirectory
 from typing import Any, Literal, get_args
 
 import cv2
@@ -20,6 +21,7 @@ THRESHOLD = 10  # grey levels of 255 above which a pixel moves
 _KEPT = 0.7  # share of the running average that is kept in the next frame
 _KERNEL = np.ones((5, 5), np.uint8)
 _SHRINK = 4
+PUBLIC_FPS = 30  # of the public code's videos of masks
 
 Kind = Literal["spatial", "spatiotemporal", "weighted", "mse"]
 
@@ -75,8 +77,39 @@ def motion_masks(frames: UInt8[np.ndarray, "T H W 3"]) -> Bool[np.ndarray, "T H 
     return np.stack(masks) > 0
 
 
-def shrink(videos: UInt8[np.ndarray, "B T H W 3"]) -> Small:
+def through_video(masks: UInt8[np.ndarray, "T H W"]) -> UInt8[np.ndarray, "T H W"]:
+    """Returns masks of 0 and 255 as the public code reads them back from an MPEG-4 video, which loses details.
+
+    An odd last row or column is dropped there; here it is written a second time and dropped again.
+
+    Raises:
+        Unavailable: OpenCV cannot write such videos.
+    """
+    height = masks.shape[1]
+    width = masks.shape[2]
+    even = np.pad(masks, ((0, 0), (0, height % 2), (0, width % 2)), mode="edge")
+    with TemporaryDirectory() as folder:
+        path = f"{folder}/masks.mp4"
+        codec = cv2.VideoWriter.fourcc(*"mp4v")
+        writer = cv2.VideoWriter(path, codec, PUBLIC_FPS, (even.shape[2], even.shape[1]), isColor=False)
+        for frame in even:
+            writer.write(frame)
+        writer.release()
+        reader = cv2.VideoCapture(path)
+        frames = []
+        while (read := reader.read())[0]:
+            frames.append(read[1][:height, :width, 0])
+        reader.release()
+    if len(frames) != len(masks):
+        raise Unavailable("OpenCV writes no MPEG-4 video here; score without --as-published")
+    return np.stack(frames)
+
+
+def shrink(videos: UInt8[np.ndarray, "B T H W 3"], as_published: bool = False) -> Small:
     """Makes the masks of videos, and resizes masks and frames to a quarter of their size with bilinear interpolation.
+
+    Args:
+        as_published: whether masks go through a lossy video first.
 
     Raises:
         Unavailable: the frames are smaller than 4×4 pixels.
@@ -89,7 +122,8 @@ def shrink(videos: UInt8[np.ndarray, "B T H W 3"]) -> Small:
     def resized(images: Iterable[np.ndarray]) -> np.ndarray:
         return np.stack([cv2.resize(image, (width, height)) for image in images])
 
-    masks = np.stack([resized(motion_masks(video) * np.uint8(255)) > 127 for video in videos])
+    stored = through_video if as_published else np.asarray
+    masks = np.stack([resized(stored(motion_masks(video) * np.uint8(255))) > 127 for video in videos])
     return Small(masks, np.stack([resized(video) for video in videos]))
 
 
@@ -142,17 +176,17 @@ def _means(four: Four) -> dict[str, float]:
 
 
 def _small_truth(scene: Scene) -> Small:
-    return shrink(scene.truth.rgb)
+    return shrink(scene.truth.rgb, scene.as_published)
 
 
 def _second_take(scene: Scene) -> Four:
     if scene.second_take is None:
         raise Unavailable("no second take of the test clips, to which Physics-IQ's score compares the model")
-    return four_metrics(scene.of_truth(_small_truth), shrink(scene.second_take.rgb))
+    return four_metrics(scene.of_truth(_small_truth), shrink(scene.second_take.rgb, scene.as_published))
 
 
 def _small(scene: Scene) -> Small:
-    return shrink(scene.prediction.rgb)
+    return shrink(scene.prediction.rgb, scene.as_published)
 
 
 def _four(scene: Scene, first: int) -> Four:

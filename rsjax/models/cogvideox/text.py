@@ -34,7 +34,6 @@ class Texts(NamedTuple):
     embeddings: Float32[np.ndarray, "texts n w"]
 
 
-@lru_cache(maxsize=1)
 def read_texts(file: str, tokens: int, width: int) -> Texts:
     """Reads a file of embeddings.
 
@@ -44,6 +43,13 @@ def read_texts(file: str, tokens: int, width: int) -> Texts:
     path = Path(file)
     if not path.is_file():
         raise UserError(f"{path}: no such file of text embeddings; {CURE}")
+    status = path.stat()
+    return _read_texts(path, tokens, width, (status.st_size, status.st_mtime_ns, status.st_ino))
+
+
+@lru_cache(maxsize=1)
+def _read_texts(path: Path, tokens: int, width: int, version: tuple[int, ...]) -> Texts:
+    """Reads the file; ``version``, its size, time and inode, makes the cache read a replaced file again."""
     try:
         with safetensors.safe_open(path, "np") as opened:
             names = json.loads((opened.metadata() or {}).get(TEXTS, "[]"))

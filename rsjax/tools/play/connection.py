@@ -12,7 +12,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from rsjax.tools.play.answers import answer, refusal, upload
 from rsjax.tools.play.hub import IN_FLIGHT, Hub, Seat
-from rsjax.tools.play.messages import UPLOAD_BYTES, Refused, parse
+from rsjax.tools.play.messages import UPLOAD_BYTES, Refused, parse, parse_json
 from rsjax.tools.play.send_queue import SendQueue
 from rsjax.tools.play.viewer import Viewer
 
@@ -159,8 +159,8 @@ class Connection:
 def error_id(text: str | None) -> int:
     """Returns the id of a refused message, or 0 if it has none."""
     try:
-        number = json.loads(text or "null")["id"]
-    except (ValueError, TypeError, KeyError, RecursionError):
+        number = parse_json(text or "null")["id"]
+    except (ValueError, TypeError, KeyError):
         return 0
     if type(number) is int and 0 < number < 2**32:
         return number

@@ -16,6 +16,8 @@ from rsjax.tools.play.messages import Refused
 from rsjax.tools.policies.worlds.actions import action_range
 from rsjax.tools.sim.lift import STEP, TURN
 
+MOST = 1e9  # of a number in an action; far smaller ones are clipped already
+
 
 @dataclass(frozen=True)
 class Control:
@@ -65,10 +67,9 @@ class Controls:
             raise Refused("bad_action", f"an action is a list of {counts} numbers")
         if any(isinstance(number, bool) or not isinstance(number, int | float | np.number) for number in numbers):
             raise Refused("bad_action", "an action is of numbers alone")
-        with np.errstate(over="ignore"):
-            given = np.asarray(numbers, np.float64).astype(np.float32)
-        if not np.isfinite(given).all():
-            raise Refused("bad_action", "an action is of finite numbers")
+        if not all(-MOST <= number <= MOST for number in numbers):  # nor is NaN
+            raise Refused("bad_action", f"an action is of finite numbers, from -{MOST:g} to {MOST:g}")
+        given = np.asarray(numbers, np.float32)
         given = np.tile(given, self.width // len(given))
         low, high = self.limits
         taken = np.clip(given, low, high)

@@ -1,6 +1,7 @@
 """Decides which requests are allowed: by the addresses that a browser may use, and by the token."""
 
 import ipaddress
+import re
 import secrets
 from dataclasses import dataclass
 
@@ -8,6 +9,7 @@ from starlette.datastructures import Headers, QueryParams
 from starlette.types import ASGIApp as App
 from starlette.types import Message, Receive, Scope, Send
 
+_HOST = re.compile(r"(\[[^\[\]]+\]|[^\[\]:]+)(?::[0-9]{1,5})?")
 HEADERS = {
     "content-security-policy": (
         "default-src 'self'; img-src 'self' blob: data:; media-src 'self' blob:; style-src 'self'; script-src 'self'; "
@@ -25,7 +27,7 @@ def is_loopback(host: str) -> bool:
     if host.lower() == "localhost":
         return True
     try:
-        return ipaddress.ip_address(host.strip("[]")).is_loopback
+        return ipaddress.ip_address(re.sub(r"^\[(.*)\]$", r"\1", host)).is_loopback
     except ValueError:
         return False
 
@@ -92,7 +94,8 @@ class Guarded:
 
 
 def _name(host: str) -> str:
-    """Returns a Host header without its port."""
-    if host.startswith("["):
-        return host.partition("]")[0] + "]"
-    return host.partition(":")[0]
+    """Returns a Host header without its port, or "" if it is none: an address of IPv6 is in brackets."""
+    match = _HOST.fullmatch(host)
+    if match is None:
+        return ""
+    return match[1]

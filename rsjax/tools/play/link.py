@@ -14,8 +14,8 @@ from jaxtyping import Float32, UInt8
 from PIL import Image
 
 from rsjax.models.branch_states import Decoding
-from rsjax.tools.play.messages import TEXT_BYTES, Refused, whole
-from rsjax.tools.play.pictures import Upload, read_picture
+from rsjax.tools.play.messages import TEXT_BYTES, Refused, parse_json, whole
+from rsjax.tools.play.pictures import MOST_SIDE, Upload, read_picture
 from rsjax.tools.play.session import MOST_BRANCHES, MOST_SEED, Session, Settings, Start
 from rsjax.tools.play.tree import Branch
 
@@ -115,10 +115,10 @@ def _unpacked(text: object) -> dict[str, Any]:
             raise ValueError("no text")
         packed = base64.b64decode(text + "=" * (-len(text) % 4), b"-_", validate=True)
         plain = zlib.decompressobj().decompress(packed, MOST_JSON)
-        values = json.loads(plain)
+        values = parse_json(plain)
         if not isinstance(values, dict):
             raise ValueError("no object")
-    except (ValueError, binascii.Error, zlib.error, RecursionError) as error:
+    except (ValueError, binascii.Error, zlib.error) as error:
         raise Refused("bad_state", "the link is damaged: a part of it is missing or changed") from error
     return values
 
@@ -133,8 +133,8 @@ def _start(session: Session, values: dict[str, Any]) -> Start:
     picture = read_picture(base64.b64decode(begun["upload"], validate=True), size)
     if picture.size != (size, size):
         raise Refused("bad_state", f"the link's picture has {picture.size} pixels, not {size} × {size}")
-    width, height = (int(side) for side in begun["size"])
-    return Start(None, None, Upload(picture.rgb, (width, height), int(begun["square"])))
+    width, height = (whole({"size": side}, "size", 1, MOST_SIDE) for side in begun["size"])
+    return Start(None, None, Upload(picture.rgb, (width, height), whole(begun, "square", 1, min(width, height))))
 
 
 def _branch(branch: Branch, places: dict[int, int]) -> dict[str, Any]:

@@ -1,7 +1,6 @@
 """Reads the fields of a page's messages; refuses wrong ones with a message of one line."""
 
 import json
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -34,12 +33,24 @@ def parse(text: str) -> dict[str, Any]:
     if len(text) > TEXT_BYTES:
         raise Refused("too_large", f"a message can have {TEXT_BYTES} characters")
     try:
-        message = json.loads(text, parse_constant=_refuse_constant)
-    except (ValueError, RecursionError) as error:
+        message = parse_json(text)
+    except ValueError as error:
         raise Refused("bad_message", "a message is JSON") from error
     if not isinstance(message, dict) or not isinstance(message.get("type"), str):
         raise Refused("bad_message", "a message is a JSON object with a type")
     return message
+
+
+def parse_json(text: str | bytes) -> Any:
+    """Parses JSON without NaN and Infinity; fields of numbers have bounds of their own.
+
+    Raises:
+        ValueError: it is not JSON, or is nested too deeply.
+    """
+    try:
+        return json.loads(text, parse_constant=_refuse_constant)
+    except RecursionError as error:
+        raise ValueError("nested too deeply") from error
 
 
 def whole(message: dict[str, Any], name: str, low: int, high: int, default: int | None = None) -> int:
@@ -54,7 +65,7 @@ def number(message: dict[str, Any], name: str, low: float, high: float, default:
     """Returns a field that is a number from ``low`` to ``high``."""
     value: Any = message.get(name, default)
     right = isinstance(value, int | float) and not isinstance(value, bool)
-    if not right or not math.isfinite(value) or not low <= value <= high:
+    if not right or not low <= value <= high:  # nor are NaN and integers that no float can hold
         raise Refused("bad_message", f"{name} is {_short(value)}; it is a number from {low:g} to {high:g}")
     return float(value)
 

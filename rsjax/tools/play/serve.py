@@ -17,6 +17,7 @@ from rsjax.clip import Video
 from rsjax.config.fields import require, require_range
 from rsjax.errors import UserError
 from rsjax.progress import note
+from rsjax.tools.play.connections import bounded, most_connections
 from rsjax.tools.play.engine import Engine, warm_up
 from rsjax.tools.play.guard import Guard, is_loopback
 from rsjax.tools.play.hub import Hub
@@ -81,6 +82,7 @@ def serve(data: RunData, policy: Path | None, split: str, out: Path, settings: S
         server_header=False,
         ws_max_size=UPLOAD_BYTES + 1024,
         ws_per_message_deflate=False,
+        http=bounded(most_connections(settings.sessions)),
         timeout_graceful_shutdown=2,
     )
     with suppress(KeyboardInterrupt):
@@ -97,6 +99,8 @@ def listen(host: str, port: int) -> socket.socket:
     try:
         family, _, _, _, where = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
         return socket.create_server(where[:2], family=family)
+    except UnicodeError as error:  # too long, or of characters that no name can have
+        raise UserError(f"--host {host!r:.80}: is no name or address of a machine") from error
     except OSError as error:
         raise UserError(
             f"--host {host} --port {port}: {error.strerror or error}; --port 0 takes a free port"

@@ -1,6 +1,7 @@
 """The HTTP server: the page, its clips and files, and the socket."""
 
 import asyncio
+import re
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -54,7 +55,7 @@ def make_app(hub: Hub, guard: Guard, sweep: float = SWEEP) -> App:
             Route("/page/{name:path}", routes.page),
             Route("/api/health", routes.health),
             Route("/api/clips", routes.clips),
-            Route("/api/clip/{number:int}.webp", routes.clip),
+            Route("/api/clip/{number}.webp", routes.clip),
             Route("/api/file/{number}", routes.file),
             WebSocketRoute("/ws", routes.socket),
         ],
@@ -110,8 +111,11 @@ class Routes:
     async def clip(self, request: Request) -> Response:
         if refused := self._known(request):
             return refused
+        number = request.path_params["number"]
+        if not _NUMBER.fullmatch(number):
+            return await _missing(request, ValueError(number))
         try:
-            clip = await asyncio.to_thread(self._hub.run.clip, request.path_params["number"])
+            clip = await asyncio.to_thread(self._hub.run.clip, int(number))
         except Refused as error:
             return _refused(404, error.code, error.message)
         return Response(webp(clip["rgb"][0]), media_type="image/webp")
@@ -169,6 +173,7 @@ def _files(folder: Path) -> dict[str, Path]:
     return {path.relative_to(folder).as_posix(): path for path in found}
 
 
+_NUMBER = re.compile("[0-9]{1,10}")
 _LISTED = (("first", 0), ("count", 48))
 
 

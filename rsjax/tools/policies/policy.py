@@ -70,7 +70,7 @@ class Policy:
         with disk_guard(directory):
             directory.mkdir(parents=True, exist_ok=True)
         save_weights(directory / WEIGHTS, self.params)
-        write_json(directory / FILE, values)
+        write_json(directory / FILE, values, sealed=True)
 
 
 def load_policy(directory: Path) -> Policy:

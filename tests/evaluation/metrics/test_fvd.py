@@ -1,6 +1,11 @@
 """FVD: the distance against other computations of it, and the network's part on a small network in its place."""
 
+import sys
+from contextlib import nullcontext
+from importlib.machinery import ModuleSpec
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -78,6 +83,50 @@ def test_the_network_sees_the_predicted_frames_as_channels_first_videos(network:
     expected = frechet_distance(seen(given.truth), seen(given.prediction))
     assert score("fvd", given) == pytest.approx(expected, rel=1e-3)
     assert score("fvd", Scene(given.truth, given.truth, settings=given.settings)) == pytest.approx(0, abs=1e-6)
+
+
+class Numbers:
+    """An array with the methods of a tensor that the metric calls."""
+
+    def __init__(self, values: np.ndarray) -> None:
+        self.values = values
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    def float(self) -> "Numbers":
+        return Numbers(self.values.astype(np.float32))
+
+    def numpy(self) -> np.ndarray:
+        return self.values
+
+    def to(self, device: str) -> "Numbers":
+        return self
+
+    cpu = eval = lambda self: self
+
+
+class Scaled(Numbers):
+    """A network whose features are the frames' means, times the number in its file."""
+
+    def __call__(self, clips: Numbers, **options: bool) -> Numbers:
+        return Numbers(self.values * clips.values.mean((2, 3, 4)))
+
+
+def test_another_network_at_the_same_path_is_read_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a stand-in for PyTorch, which need not be installed."""
+    torch: Any = ModuleType("torch")
+    torch.__spec__ = ModuleSpec("torch", None)
+    torch.cuda = SimpleNamespace(is_available=lambda: False)
+    torch.jit = SimpleNamespace(load=lambda path, map_location: Scaled(np.array(float(Path(path).read_text()))))
+    torch.no_grad = nullcontext
+    torch.from_numpy = Numbers
+    monkeypatch.setitem(sys.modules, "torch", torch)
+    values = []
+    for scale in ("1", "2"):
+        (tmp_path / FILE).write_text(scale)
+        values.append(score("fvd", scene(EvalConfig(weights=str(tmp_path)))))
+    assert values[1] == pytest.approx(4 * values[0], rel=1e-3)
 
 
 def test_clips_that_are_too_short_have_a_reason(network: Path) -> None:

@@ -7,7 +7,16 @@ import numpy as np
 import pytest
 
 from rsjax.clip import Video
-from rsjax.evaluation.metrics.physics_iq import Four, Small, four_metrics, grey, motion_masks, physics_iq_score, shrink
+from rsjax.evaluation.metrics.physics_iq import (
+    Four,
+    Small,
+    four_metrics,
+    grey,
+    motion_masks,
+    physics_iq_score,
+    shrink,
+    through_video,
+)
 from rsjax.evaluation.registry import Scene, Unavailable
 from tests.evaluation.metrics.scored import per_frame, score
 
@@ -170,3 +179,17 @@ def test_grey_is_upright_and_rgb() -> None:
     image[:4] = (255, 0, 0)
     assert grey(image)[0, 0] == 76  # 0.299 of 255
     assert grey(image)[7, 7] == 0
+
+
+def test_masks_as_published_pass_through_a_lossy_video() -> None:
+    truth, made = (np.stack([drifting(seed) for seed in seeds]) for seeds in ((0, 1), (2, 3)))
+    plain, stored = (shrink(truth, as_published) for as_published in (False, True))
+    np.testing.assert_array_equal(plain.frames, stored.frames)
+    changed = (plain.masks != stored.masks).mean()
+    assert 0 < changed < 0.05
+    for as_published in (False, True):
+        scene = Scene(Video(truth), Video(made), as_published=as_published)
+        expected = four_metrics(shrink(truth, as_published), shrink(made, as_published), 1)
+        np.testing.assert_array_equal(score("physics_iq_spatiotemporal", scene)[""], expected.spatiotemporal.mean(1))  # type: ignore[index,call-overload]
+    odd = (np.random.default_rng(0).random((4, 9, 7)) > 0.5).astype(np.uint8) * 255
+    assert through_video(odd).shape == odd.shape

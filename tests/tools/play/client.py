@@ -11,6 +11,7 @@ from typing import Any
 import uvicorn
 from websockets.sync.client import ClientConnection, connect
 
+from rsjax.tools.play.connections import bounded, most_connections
 from rsjax.tools.play.guard import Guard
 from rsjax.tools.play.hub import Hub
 from rsjax.tools.play.messages import UPLOAD_BYTES
@@ -140,6 +141,7 @@ def serving(hub: Hub, token: str = "", sweep: float = 0.05) -> Iterator[Server]:
         log_level="critical",
         ws_max_size=UPLOAD_BYTES + 1024,
         ws="websockets-sansio",
+        http=bounded(most_connections(hub.most)),
         timeout_graceful_shutdown=2,
     )
     server = uvicorn.Server(config)

@@ -11,6 +11,7 @@ from typing import Any
 import av
 import numpy as np
 import pytest
+from PIL import Image
 
 from rsjax.data.store import open_store
 from rsjax.tools.play import keep
@@ -79,10 +80,20 @@ def test_links_that_cannot_be_are_refused(server: Server) -> None:
         page.drive(2)
         state = page.ask("link")["state"]
         row = unpacked(state)["branches"][0]
+        side = server.hub.run.data.config.clips.image_size
+        buffer = io.BytesIO()
+        Image.new("RGB", (side, side)).save(buffer, "PNG")
+        picture = base64.b64encode(buffer.getvalue()).decode()
+        begun = {"upload": picture, "size": [90, 70], "square": 70}
+        assert page.ask("load", state=changed(state, start=begun))["start"]["upload"]["from"] == [90, 70]
+        assert page.ask("load", state=state)["type"] == "session"
         bad = [
             None, "", "%%%", state[:-9], bomb,
             changed(state, version=2), changed(state, run="0" * 16), changed(state, start={"clip": 99}),
             changed(state, start={"upload": "????", "size": [1, 1], "square": 1}), changed(state, branches=[]),
+            *(changed(state, start=begun | {"size": size, "square": square})
+              for size, square in (([-1, 64], 1), ([64, 10**400], 64), ([64, float("inf")], 64), ([64, 64], -3),
+                                   ([64, 64], 65), ([64], 64), ("64", 6), ([64.0, 64], 64))),
             changed(state, branches=[row | {"actions": row["actions"][:8]}]),
             changed(state, branches=[row | {"how": [[row["how"][0][0], 10**9]]}]),
             changed(state, branches=[row, row | {"parent": 1}]), changed(state, seed=-1), changed(state, settings=None),

@@ -57,6 +57,8 @@ def test_pages_of_other_sites_and_other_names_are_refused(server: Server) -> Non
         assert welcome["type"] == "welcome"
     for path in ("/", "/api/health", "/api/clips", "/page/index.html"):
         assert server.get(path, host="evil.example")[0] == 403
+        for broken in ("[::1", "[::1]evil", "localhost:80:evil", "localhost:x", "::1"):
+            assert server.get(path, host=broken)[0] == 403, broken
         assert server.get(path, host=f"localhost:{server.port}")[0] in (200, 404)
 
 
@@ -103,6 +105,25 @@ def test_garbage_is_refused_and_in_the_end_its_sender_too(server: Server) -> Non
         assert closing(page)[0] in (1009, 0)  # it may end before its last word is read
     with server.client() as (page, _):
         assert page.ask("ping")["type"] == "pong"
+
+
+def test_numbers_without_bounds_are_refused_where_they_come_in(server: Server) -> None:
+    assert server.get(f"/api/clip/{'9' * 4400}.webp")[0] == server.get("/api/clip/-1.webp")[0] == 404
+    assert server.get(f"/api/clips?first={'9' * 4400}")[0] == 400
+    with server.client() as (page, welcome):
+        page.ask("start", clip=0)
+        huge = 10**400
+        rest = [each["rest"] for each in welcome["controls"]]
+        for kind, code, fields in (
+            ("settings", "bad_settings", {"temperature": huge}),
+            ("settings", "bad_settings", {"steps": -huge}),
+            ("step", "bad_action", {"branch": 0, "action": [huge, *rest[1:]]}),
+            ("step", "bad_action", {"branch": 0, "action": [1e300, *rest[1:]]}),
+            ("step", "bad_message", {"branch": huge, "action": rest}),
+            ("record", "bad_message", {"format": "gif", "branch": 0, "panes": ["rgb"], "fps": huge}),
+            ("start", "bad_message", {"clip": huge}),
+        ):
+            assert page.ask(kind, **fields)["error"] == code, (kind, fields)
 
 
 def test_a_flood_is_slowed_and_then_ended(server: Server) -> None:
@@ -258,7 +279,8 @@ def test_no_bytes_break_the_readers(payload: bytes) -> None:
 @pytest.mark.parametrize(
     ("host", "loopback"),
     [("localhost", True), ("127.3.2.1", True), ("::1", True), ("[::1]", True), ("0.0.0.0", False), ("::", False),
-     ("10.0.0.1", False), ("localhost.evil.example", False), ("127.0.0.1.evil.example", False), ("", False)],
+     ("[::1", False), ("::1]", False), ("10.0.0.1", False), ("localhost.evil.example", False),
+     ("127.0.0.1.evil.example", False), ("", False)],
 )  # fmt: skip
 def test_what_is_this_machine(host: str, loopback: bool) -> None:
     assert is_loopback(host) == loopback

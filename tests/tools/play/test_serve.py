@@ -1,6 +1,7 @@
 """The command: what it refuses before it serves, and that it serves and stops."""
 
 import socket
+from contextlib import suppress
 
 import pytest
 
@@ -20,6 +21,12 @@ def test_a_port_that_is_taken_is_named() -> None:
         assert _address(taken, "127.0.0.1", Guard("")) == f"http://127.0.0.1:{port}/"
         assert _address(taken, "::1", Guard("abc")) == f"http://[::1]:{port}/?token=abc"
         assert _address(taken, "0.0.0.0", Guard("abc")) == f"http://{socket.gethostname()}:{port}/?token=abc"
+
+
+@pytest.mark.parametrize("host", ["x" * 300, "\ud800", "a..b", ""])
+def test_a_host_that_is_none_is_one_line(host: str) -> None:
+    with suppress(UserError), listen(host, 0):  # "" may mean every address
+        assert host == ""
 
 
 @pytest.mark.parametrize("wrong", [{"sessions": 0}, {"lanes": 0}, {"port": 2**16}, {"idle_minutes": 0.0}])

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from rsjax.errors import UserError, did_you_mean, first_line
-from rsjax.files import write_file
+from rsjax.files import regular, write_file
 from rsjax.tools.policies.judges.judge import LABELS, UNINTERPRETABLE
 from rsjax.tools.studies.report.video import write_mp4
 
@@ -59,7 +59,7 @@ class HumanJudge:
             UserError: the sheet is missing or lacks a column, or a video has no label, an unknown label or two labels.
         """
         try:
-            with sheet.open(newline="", encoding="utf-8-sig") as file:
+            with regular(sheet).open(newline="", encoding="utf-8-sig") as file:
                 reader = csv.DictReader(file)
                 rows = list(reader)
         except (OSError, UnicodeDecodeError, csv.Error) as error:
