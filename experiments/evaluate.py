@@ -17,7 +17,7 @@ CHANGES = (
     *("prompt_frames", "horizon", "resolution", "steps", "temperature", "samples", "clips", "repetitions"),
     *("action_draws", "depth_alignment", "depth_source"),
 )
-_IN_PROTOCOL = ("clips", "repetitions", "action_draws", "report_clips")
+_IN_PROTOCOL = ("clips", "repetitions", "action_draws")
 _SETTINGS: list[Any] = [
     (name, hint | None, None) for name, hint in get_type_hints(EvalConfig).items() if name not in _IN_PROTOCOL
 ]

@@ -55,7 +55,7 @@ def debug() -> Config:
         ),
         train=TrainConfig(steps=4, batch_size=2),
         runtime=RuntimeConfig(log_every=2, checkpoint_every=2),
-        eval=EvalConfig(clips=2, batch_size=2, action_draws=1, report_clips=2, localiser_steps=10, weights=""),
+        eval=EvalConfig(clips=2, batch_size=2, action_draws=1, localiser_steps=10, weights=""),
     )
 
 
@@ -131,7 +131,7 @@ def roboscape_tiny() -> Config:
             ema=0.995,
         ),
         runtime=RuntimeConfig(checkpoint_every=500, eval_every=1000),
-        eval=EvalConfig(clips=100, batch_size=20, report_clips=6),
+        eval=EvalConfig(clips=100, batch_size=20),
     )
 
 

@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 from rsjax.config.data import ClipShape, DataConfig
 from rsjax.config.fields import check_numbers, require, require_range
@@ -22,11 +22,12 @@ SIMULATOR_STEPS = 2000  # its training steps
 class EvalConfig:
     """Settings of the evaluation on the test split."""
 
+    retired: ClassVar[tuple[str, ...]] = ("report_clips",)  # fields that a file of an earlier version may have
+
     clips: int = 20  # clips that are scored, spread evenly over the test split
     repetitions: int = 1  # how often each clip is generated, with different random draws
     batch_size: int = 10  # clips that are generated at once; lower it where memory runs out
     action_draws: int = 3  # random action sequences per clip and kind of ΔPSNR; fewer are faster and noisier
-    report_clips: int = 4  # clips shown in the report: half typical ones, half the worst
     localiser_steps: int = 500  # training steps of the network that finds cube and gripper in frames
     # A directory with files that are not part of this project: lpips_alex.safetensors and lpips_vgg.safetensors of
     # python -m experiments.convert lpips, and i3d_torchscript.pt for FVD. Without its file, a metric is null. Only the
@@ -45,7 +46,6 @@ class EvalConfig:
             "repetitions",
             "batch_size",
             "action_draws",
-            "report_clips",
             "localiser_steps",
         )
         require(

@@ -207,7 +207,7 @@ def evaluate(
     return Evaluation(
         metrics=scores,
         reasons=scored.reasons,
-        shown=shown_arrays(clips, first, per_clip["psnr"], settings.report_clips),
+        shown=shown_arrays(clips, first, per_clip["psnr"]),
         per_clip={name: values.tolist() for name, values in per_clip.items()},
         curves=mean_curves(curves),
         repetitions=[summarised(each, interval=False) for each in repetitions],

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int
 from rsjax.data.clips import Clips, spread
 from rsjax.evaluation.registry import PerClip, Scene
 
+REPORT_CLIPS = 6  # clips that a report shows: half typical ones, half the worst
 EXTREMES = 3  # clips at either end of the ranking that comparisons show
 KEPT_CLIPS = 24  # clips whose frames are kept for comparisons, spread evenly; those of :func:`extremes` are added
 
@@ -52,11 +53,11 @@ def extremes(
     return order[:count], order[::-1][:count]
 
 
-def shown_arrays(clips: Clips, scenes: Mapping[str, Scene], psnr: PerClip, count: int) -> dict[str, np.ndarray]:
+def shown_arrays(clips: Clips, scenes: Mapping[str, Scene], psnr: PerClip) -> dict[str, np.ndarray]:
     """Returns arrays of the clips in the report, in the order of :func:`choose_clips`."""
     success = clips.success[:, -1]
     prediction = scenes[""].prediction
-    rows, ranks = choose_clips(psnr, success, count)
+    rows, ranks = choose_clips(psnr, success, REPORT_CLIPS)
     arrays: dict[str, Any] = {
         "clip": clips.index[rows],
         "task": np.array(clips.task)[rows],

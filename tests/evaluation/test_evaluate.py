@@ -98,7 +98,7 @@ def test_own_actions_in_place_of_random_ones_make_no_difference(clips: Store, mo
     """The sampling key is the same: with the same actions every ΔPSNR is 0, at random draws too."""
     config = replace(
         toy.with_model(toy.config(), sample=SampleConfig(temperature=1.0)),
-        eval=EvalConfig(clips=4, batch_size=4, action_draws=1, report_clips=1, weights=""),
+        eval=EvalConfig(clips=4, batch_size=4, action_draws=1, weights=""),
     )
     monkeypatch.setattr(evaluation.delta_psnr, "other_clips", lambda clips, draws, seed: np.arange(clips)[None])
     monkeypatch.setattr(evaluation.delta_psnr, "uniform_actions", lambda own, *_, seed: own[None])
@@ -114,6 +114,7 @@ def test_every_registered_metric_has_a_score_or_a_reason(result: Evaluation) -> 
         *("lpips_alex", "lpips_vgg", "fvd", "physics_iq_score"),
         *PLACES,
         *PROBED,
+        *(name for name in metrics() if name.startswith(("state_", "coverage"))),
     }
     assert result.metrics["depth_absrel_median_branch_repeat_first"] > 0
 
@@ -123,10 +124,10 @@ def test_shown_clips_are_typical_ones_and_the_worst_by_their_own_psnr(
 ) -> None:
     own = generated(trained, TRUTH["actions"]).rgb
     scores = [psnr(TRUTH["rgb"][[i]], own[[i]]) for i in range(toy.TEST)]
-    rows, ranks = choose_clips(np.array(scores), np.array(toy.SUCCESS), 3)
+    rows, ranks = choose_clips(np.array(scores), np.array(toy.SUCCESS), 6)
     assert result.shown["clip"].tolist() == rows.tolist()
     assert rows[1] == np.argmin(scores)
-    assert result.shown["rank"].tolist() == ranks.tolist() == [0, 1, 0]
+    assert result.shown["rank"].tolist() == ranks.tolist() == [0, 1, 0, 2, 0]
     np.testing.assert_allclose(result.shown["psnr"], np.array(scores)[rows], rtol=1e-4)
     np.testing.assert_array_equal(result.shown["truth"], TRUTH["rgb"][rows])
     np.testing.assert_array_equal(result.shown["true_depth"], TRUTH["depth"][rows])

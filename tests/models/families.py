@@ -23,7 +23,7 @@ RUNTIME = RuntimeConfig(log_every=1, checkpoint_every=2, eval_every=4)
 def engine(config: Config) -> Config:
     """The configuration with two short trainings and a short evaluation."""
     tokenizer = replace(config.tokenizer_train, **TRAIN, frames_per_clip=3, depth_share=0.0)
-    scored = replace(config.eval, clips=2, action_draws=1, report_clips=1)
+    scored = replace(config.eval, clips=2, action_draws=1)
     return replace(config, tokenizer_train=tokenizer, train=TrainConfig(**TRAIN), runtime=RUNTIME, eval=scored)
 
 

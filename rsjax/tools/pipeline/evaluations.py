@@ -35,7 +35,7 @@ from rsjax.tools.sim import probes, retakes
 from rsjax.training.distributed import barrier, is_lead, on_lead
 
 FOLDER = "evaluations"
-NOT_OF_METRICS = ("clips", "repetitions", "action_draws", "batch_size", "report_clips")
+NOT_OF_METRICS = ("clips", "repetitions", "action_draws", "batch_size")
 
 
 @dataclass(frozen=True)

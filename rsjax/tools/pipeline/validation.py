@@ -20,6 +20,7 @@ from rsjax.data.normalization import Normalization
 from rsjax.data.store import RecordSource, Store
 from rsjax.evaluation.metrics.psnr import psnr
 from rsjax.evaluation.registry import Scene, Unavailable, metrics
+from rsjax.evaluation.shown import REPORT_CLIPS
 from rsjax.models.base import Assets, WorldModel, create_autoencoder, create_model
 from rsjax.models.load_run import load_tokenizer
 from rsjax.tokenizers.codec import Codec
@@ -61,7 +62,7 @@ class WorldModelValidation:
         made = self._model.generate(weights, self._assets, prompt, clips.actions, index=clips.index)
         scores = _watched(clips, made, cfg.prompt_frames)
         pictures = {}
-        for row, number in enumerate(clips.index[: cfg.eval.report_clips]):
+        for row, number in enumerate(clips.index[:REPORT_CLIPS]):
             depth = made.depth[row] if made.depth is not None and clips.has_depth[row] else None
             figure = ClipFigure(
                 title=f"clip {number} at step {step}",
@@ -143,7 +144,7 @@ class TokenizerValidation:
             metric = -((1 - share) * of_rgb + share * of_depth)
         pictures = {
             f"clip_{number:03d}": _sheet(f"clip {number} at step {step}", shown[number])
-            for number in clips.index[: cfg.eval.report_clips]
+            for number in clips.index[:REPORT_CLIPS]
         }
         return Validation(metric, scalars, pictures)
 

@@ -36,7 +36,7 @@ CLIPS = toy.TEST
 
 
 def config() -> Config:
-    return replace(toy.config(), eval=EvalConfig(clips=CLIPS, batch_size=CLIPS, action_draws=1, report_clips=2))
+    return replace(toy.config(), eval=EvalConfig(clips=CLIPS, batch_size=CLIPS, action_draws=1))
 
 
 @pytest.fixture(scope="module")
@@ -107,7 +107,7 @@ def test_the_videos_score_as_in_the_final_evaluation(run: Run, found: Validation
 def test_there_is_a_picture_of_each_shown_clip_with_depth_only_where_the_model_has_it(
     run: Run, found: Validation, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert list(found.pictures) == ["clip_000", "clip_001"]
+    assert list(found.pictures) == [f"clip_{number:03d}" for number in range(toy.TEST)]
     blind = Run(toy.with_model(run.config, depth=NoDepth()), run.directory, run.data_directory)
     monkeypatch.setattr(module, "validation_loss", lambda *_: {"loss": 0.5})
     seen = WorldModelValidation(blind)(7, trained(blind).params)
@@ -126,7 +126,7 @@ def test_the_tokenizer_scores_as_its_codec_does(run: Run) -> None:
     assert found.scalars == pytest.approx({"validation/psnr": of_rgb, "validation/psnr_depth": of_depth})
     share = run.config.tokenizer_train.depth_share
     assert found.metric == pytest.approx(-(1 - share) * of_rgb - share * of_depth)
-    assert list(found.pictures) == ["clip_000", "clip_001"]
+    assert list(found.pictures) == [f"clip_{number:03d}" for number in range(toy.TEST)]
 
 
 class Damaged:

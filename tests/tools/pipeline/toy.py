@@ -32,7 +32,7 @@ def config() -> Config:
     return replace(
         with_model(debug, sample=SampleConfig(steps=2, unmask="greedy")),
         sim=replace(debug.sim, episodes=TRAIN + TEST, test_episodes=TEST),
-        eval=EvalConfig(clips=TEST, batch_size=2, action_draws=2, report_clips=3, weights=""),
+        eval=EvalConfig(clips=TEST, batch_size=2, action_draws=2, weights=""),
     )
 
 
