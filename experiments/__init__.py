@@ -1,4 +1,4 @@
-"""The commands, ``python -m experiments.<name>``: each one parses its arguments and calls the library."""
+"""The commands as modules: ``python -m experiments.NAME`` is ``rsjax NAME``."""
 
 from rsjax.runtime import answer_while_importing
 

@@ -1,36 +1,6 @@
-"""Describes a preset: modules, parameters, operations, memory. ``python -m experiments.describe roboscape_s``"""
+"""``python -m experiments.describe`` is ``rsjax describe``."""
 
-import json
-import sys
-from dataclasses import dataclass
-
-from experiments.cli import main_errors, parse
-
-PROG = "python -m experiments.describe"
-
-
-@dataclass(frozen=True)
-class Options:
-    """Options of this command."""
-
-    json: bool = False
-    """Print the numbers as one JSON object instead."""
-
-
-@main_errors()
-def main() -> None:
-    """Prints the description."""
-    config, options = parse(sys.argv[1:], PROG, "Counts parameters, operations and memory, from shapes.", Options())
-    from rich.console import Console
-
-    from rsjax.tools.describe import describe, render
-
-    description = describe(config)
-    if options.json:
-        print(json.dumps({"preset": description.name} | description.figures, indent=1))
-    else:
-        Console().print(render(description))
-
+from rsjax.tools.commands.describe import main
 
 if __name__ == "__main__":
     main()

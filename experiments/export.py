@@ -1,48 +1,6 @@
-"""Writes a store of clips in another project's format. ``python -m experiments.export lerobot STORE OUT``"""
+"""``python -m experiments.export`` is ``rsjax export``."""
 
-import sys
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated
-
-import tyro
-from tyro.conf import Positional, arg
-
-from experiments.cli import main_errors, parse_options
-from rsjax.config import ConfigError
-from rsjax.tools.export.lerobot import LeRobotOptions, export_lerobot
-
-PROG = "python -m experiments.export"
-
-
-@dataclass(frozen=True)
-class Options(LeRobotOptions):
-    """Options of this command: the store, the new data set, and how it is written."""
-
-    store: Annotated[Positional[Path], arg(metavar="STORE")] = tyro.MISSING
-    """A store of clips."""
-    out: Annotated[Positional[Path], arg(metavar="OUT")] = tyro.MISSING
-    """Directory of the new data set, which must not exist."""
-
-
-@main_errors()
-def main() -> None:
-    """Writes the data set and prints what it contains."""
-    word, *argv = sys.argv[1:] or [""]
-    if word != "lerobot" and not {"-h", "--help"} & {word}:
-        raise ConfigError(f"name a format first; usage: {PROG} lerobot STORE OUT; formats: lerobot")
-    if word != "lerobot":
-        argv = ["--help"]
-    options = parse_options(argv, f"{PROG} lerobot", "Writes a store as a LeRobotDataset.", Options())
-    from rsjax.data.store import open_store
-    from rsjax.progress import Progress
-
-    store = open_store(options.store)
-    with Progress("export", sum(store.counts().values()), "episodes") as progress:
-        info = export_lerobot(store, options.out, options, lambda done, total: progress.update(done))
-    counts = ", ".join(f"{info[f'total_{name}']} {name}" for name in ("episodes", "frames", "tasks"))
-    print(f"{options.out.absolute()}: LeRobotDataset {options.version}, {counts}, {info['fps']:g} fps")
-
+from rsjax.tools.commands.export import main
 
 if __name__ == "__main__":
     main()

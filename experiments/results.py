@@ -1,54 +1,6 @@
-"""Makes the tables of the pages on results from the files of results. ``python -m experiments.results``"""
+"""``python -m experiments.results`` is ``rsjax results``."""
 
-import sys
-from dataclasses import dataclass
-from pathlib import Path
-
-from experiments.cli import main_errors, parse_options
-from rsjax.config import require
-from rsjax.errors import UserError
-
-PROG = "python -m experiments.results"
-
-
-@dataclass(frozen=True)
-class Options:
-    """Makes the tables of docs/results and of the README anew from the files in docs/results/data."""
-
-    add: tuple[str, ...] = ()
-    """First copy what a study has measured for these claims."""
-    study: Path = Path("runs/paper")
-    """The directory of experiments.paper that --add takes the claims from."""
-    run: tuple[Path, ...] = ()
-    """First write the scores of these finished runs, which differ in their seeds."""
-    name: str = ""
-    """The name of the file that --run writes; or --add, if it is not the claim's: table1-multitask."""
-    check: bool = False
-    """Change nothing; name each table that differs from its file, and exit with 2 if there is any."""
-
-
-@main_errors()
-def main() -> None:
-    """Writes the pages, or checks them."""
-    options = parse_options(sys.argv[1:], PROG, Options.__doc__ or "", Options())
-    from rsjax.tools.studies import result_pages
-
-    root = Path(__file__).resolve().parents[1]
-    named = len(options.add) + bool(options.run)
-    require(not options.name or named == 1, f"--name names one file, but --add and --run write {named}")
-    require(not options.run or bool(options.name), "--run needs --name, the name of its file, such as tiny")
-    for claim in options.add:
-        print(result_pages.add_result(root, options.study, claim, options.name))
-    if options.run:
-        print(result_pages.add_runs(root, options.run, options.name))
-    if options.check:
-        differing = list(result_pages.differences(root))
-        if differing:
-            raise UserError("; ".join(differing) + f" ({PROG} makes them anew)")
-    else:
-        for page in result_pages.write_pages(root):
-            print(page)
-
+from rsjax.tools.commands.results import main
 
 if __name__ == "__main__":
     main()

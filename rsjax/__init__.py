@@ -18,12 +18,12 @@ if TYPE_CHECKING:
     from rsjax.data.store import Store
     from rsjax.models.trained import TrainedModel
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 __all__ = ["__version__", "load", "open_store", "write_store"]
 
 
 def load(run: "Path | str") -> "TrainedModel":
-    """Loads the trained world model from a run directory that ``experiments.train`` made.
+    """Loads the trained world model from a run directory that ``rsjax train`` made.
 
     Args:
         run: the directory, such as ``"runs/tiny"``.
@@ -40,7 +40,7 @@ def load(run: "Path | str") -> "TrainedModel":
 
 
 def open_store(path: "Path | str") -> "Store":
-    """Opens a store of clips, such as ``experiments.train`` and ``experiments.ingest`` write.
+    """Opens a store of clips, such as ``rsjax train`` and ``rsjax ingest`` write.
 
     Args:
         path: the store's directory.
@@ -58,7 +58,7 @@ def open_store(path: "Path | str") -> "Store":
 
 
 def write_store(path: "Path | str", clips: "Iterable[Mapping[str, Any] | Clip]", *, test_share: float = 0.1) -> "Store":
-    """Writes a store of clips, on which ``experiments.train PRESET --store PATH`` can train.
+    """Writes a store of clips, on which ``rsjax train PRESET --store PATH`` can train.
 
     Args:
         path: the store's directory; an older store there is replaced once the new one is complete.
@@ -77,7 +77,7 @@ def write_store(path: "Path | str", clips: "Iterable[Mapping[str, Any] | Clip]",
 
             Only ``rgb`` and ``actions`` are required.
         test_share: share of the episodes, chosen by a hash of their names, whose clips are the test split. With 0 the
-            test split is empty, and ``experiments.train`` refuses to train a world model on the store.
+            test split is empty, and ``rsjax train`` refuses to train a world model on the store.
 
     Returns:
         The store, opened.

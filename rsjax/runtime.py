@@ -98,12 +98,13 @@ def _processor() -> str:
 
 
 def answer_while_importing() -> None:
-    """Lets Ctrl-C and SIGTERM end ``python -m`` with one line while a command's modules are imported.
+    """Lets Ctrl-C and SIGTERM end a command with one line while its modules are imported.
 
     A package of commands calls this before it imports anything else; :func:`stop_signals` takes over. Does nothing
     if another program imports the package.
     """
-    if sys.argv[:1] != ["-m"]:  # which Python sets while it looks for the module to run
+    # "-m" is what Python sets while it looks for the module to run; rsjax is the script that an installation makes.
+    if not sys.argv or (sys.argv[0] != "-m" and Path(sys.argv[0]).name != "rsjax"):
         return
     for number, answer in ANSWERS.items():
         if signal.getsignal(number) != signal.SIG_IGN:

@@ -10,10 +10,10 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from experiments.cli import parse
-from experiments.compile import Options, enter_environment
 from rsjax.command import main_errors
 from rsjax.files import write_json
+from rsjax.tools.commands.cli import parse
+from rsjax.tools.commands.compile import Options, enter_environment
 
 COSTS = ("roofline_s", "bytes", "kernels")
 TOLERANCE = 0.02

@@ -14,14 +14,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from experiments.cli import parse
-from experiments.train import Options
 from rsjax.artifact import MARK
 from rsjax.data.normalization import Normalization
 from rsjax.data.token_sets import tokenizer_key, tokens_key
 from rsjax.errors import UserError
 from rsjax.files import write_file, write_json
 from rsjax.runtime import HUGE_PAGES
+from rsjax.tools.commands.cli import parse
+from rsjax.tools.commands.train import Options
 from rsjax.tools.pipeline.run import Run
 from rsjax.training.checkpoint import Checkpoints, save_weights
 from tests.tools.pipeline import toy

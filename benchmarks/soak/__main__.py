@@ -9,7 +9,7 @@ from functools import partial
 from benchmarks.soak.runs import Options, Soak, without
 from benchmarks.soak.soak import run_soak
 from benchmarks.soak.table import markdown, passed
-from experiments.cli import main_errors, parse
+from rsjax.tools.commands.cli import main_errors, parse
 
 PROG = "python -m benchmarks.soak"
 

@@ -16,7 +16,7 @@ class ClipShape:
 
 @dataclass(frozen=True)
 class DataConfig:
-    """A store of clips made by ``experiments.ingest``, to train on instead of simulated episodes.
+    """A store of clips made by ``rsjax ingest``, to train on instead of simulated episodes.
 
     ``--store`` fills it in (:func:`rsjax.tools.pipeline.run_clips.on_store`).
     """

@@ -30,11 +30,11 @@ class EvalConfig:
     action_draws: int = 3  # random action sequences per clip and kind of ΔPSNR; fewer are faster and noisier
     localiser_steps: int = 500  # training steps of the network that finds cube and gripper in frames
     # A directory with files that are not part of this project: lpips_alex.safetensors and lpips_vgg.safetensors of
-    # python -m experiments.convert lpips, and i3d_torchscript.pt for FVD. Without its file, a metric is null. Only the
+    # rsjax convert lpips, and i3d_torchscript.pt for FVD. Without its file, a metric is null. Only the
     # default directory may be missing; "": no files.
     weights: str = WEIGHTS
     # What estimates depth from frames: simulator, a small network that learns from the run's own clips (or, with fewer
-    # or more steps, simulator:steps=500), or a network and its files, as in experiments.ingest --depth.
+    # or more steps, simulator:steps=500), or a network and its files, as in rsjax ingest --depth.
     depth_estimator: str = ""
 
     def __post_init__(self) -> None:

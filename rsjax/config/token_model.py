@@ -25,7 +25,7 @@ class CorruptionConfig:
 
 @dataclass(frozen=True)
 class PublicCodeConfig:
-    """Options of the public Genie that published weights may use; ``experiments.convert`` sets them."""
+    """Options of the public Genie that published weights may use; ``rsjax convert`` sets them."""
 
     qk_norm: bool = False  # one LayerNorm normalises each head's queries and keys, in place of norm1 and norm2
     mup: bool = False  # attention scale 8/head width instead of 1/√(head width); the heads' input ÷ (width/256)

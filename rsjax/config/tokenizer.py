@@ -91,7 +91,7 @@ class PerceptualConfig:
     """The LPIPS term, as in the reference."""
 
     weight: float = 1.0
-    # A safetensors file of python -m experiments.convert lpips; empty: the term is skipped, with a note.
+    # A safetensors file of rsjax convert lpips; empty: the term is skipped, with a note.
     lpips: str = ""
 
     def __post_init__(self) -> None:

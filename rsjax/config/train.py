@@ -128,7 +128,7 @@ class TrainConfig:
     optimizer: AdamW | Muon = AdamW()
     ema: float = 0.0  # decay of the averaged weights that later stages use; 0: no averaging
     seed: int = 0  # of the initial weights and of all draws; compare results over several
-    # A run directory, or one made by python -m experiments.convert, whose weights training starts from. With it, steps
+    # A run directory, or one made by rsjax convert, whose weights training starts from. With it, steps
     # may be 0, which uses the weights unchanged. The content key covers the path, not the files.
     start_from: str = ""
     # A curriculum, stage after stage, whose epochs determine the number of steps (``steps`` is ignored; commands refuse

@@ -175,7 +175,7 @@ def open_store(path: Path | str) -> Store:
     place = path / MANIFEST
     again = f"delete {path} and make it again"
     ours = any(path.glob("*.array_record"))
-    cure = again if ours else "give a store, or make one with experiments.ingest"
+    cure = again if ours else "give a store, or make one with rsjax ingest"
     if not ours and not os.path.lexists(place):
         raise StoreError(f"{path}: {f'no store (it has no {MANIFEST})' if path.exists() else 'not there'}; {cure}")
     try:

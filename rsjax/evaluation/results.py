@@ -146,7 +146,7 @@ def read_result(folder: Path) -> Result:
         FileError: the file is missing, damaged or of another version.
     """
     path = folder / NAME
-    cure = "python -m experiments.evaluate makes it again"
+    cure = "rsjax evaluate makes it again"
     try:
         return Result(**read_json(path, cure=cure))
     except TypeError as error:

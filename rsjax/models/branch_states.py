@@ -1,4 +1,4 @@
-"""The interface of models that can continue a clip from any frame, in several ways; ``experiments.play`` needs it."""
+"""The interface of models that can continue a clip from any frame, in several ways; ``rsjax play`` needs it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field

@@ -35,7 +35,7 @@ def load_config(run: Path) -> Config:
     """
     path = run / "config.json"
     if not path.exists():
-        raise UserError(f"{path}: missing, so {run} is not a run directory; make one with python -m experiments.train")
+        raise UserError(f"{path}: missing, so {run} is not a run directory; make one with rsjax train")
     try:
         return from_dict(Config, read_json(path, cure="the train command of this run writes it again"))
     except (ConfigError, TypeError) as error:

@@ -1,4 +1,4 @@
-"""Reads the settings of a family's networks in a run directory, or in one made by ``python -m experiments.convert``."""
+"""Reads the settings of a family's networks in a run directory, or in one made by ``rsjax convert``."""
 
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -22,7 +22,7 @@ def read_model(directory: Path, kind: type[M], part: str) -> M:
         UserError: the weights or their settings are missing, damaged, of another version or of another family.
     """
     path = directory / "config.json"
-    settings = read_json(path, cure="make it with python -m experiments.convert")
+    settings = read_json(path, cure="make it with rsjax convert")
     check_family(path, settings, (kind.family,))
     if "model" not in settings or not (directory / part / "weights").exists():
         raise UserError(f"{directory}: holds no {part}/weights of a model {kind.family!r} with settings in config.json")
@@ -62,9 +62,9 @@ def saved_inputs(directory: Path) -> Inputs:
         UserError: the settings are missing, damaged or of another version.
     """
     path = directory / "config.json"
-    settings = read_json(path, cure="make it with python -m experiments.convert")
+    settings = read_json(path, cure="make it with rsjax convert")
     try:
-        if "inputs" in settings:  # written by python -m experiments.convert
+        if "inputs" in settings:  # written by rsjax convert
             return Inputs(**{name: int(value) for name, value in settings["inputs"].items()})
         clips = from_dict(Config, settings).clips
         return Inputs(clips.image_size, clips.action_dim)

@@ -1,7 +1,7 @@
 """LPIPS, the learned perceptual distance of images (Zhang et al. 2018, version 0.1), with AlexNet or VGG16.
 
 Its weights are not part of this project. They are read from one safetensors file, which
-``python -m experiments.convert lpips`` makes from the public weights:
+``rsjax convert lpips`` makes from the public weights:
 
     backbone.{i}.weight, .bias   torchvision's ``features.{i}``: (out, in, kernel, kernel), (out,)
     head.{k}.weight              of tap k: (1, channels, 1, 1)
@@ -98,7 +98,7 @@ def load_lpips(path: str | Path, wanted_net: str = "") -> dict[str, Any]:
         LpipsError: the file is missing or damaged, or a tensor is missing, unexpected or of another shape.
     """
     if not Path(path).is_file():
-        raise LpipsError(f"{path}: no such LPIPS weights; make them with python -m experiments.convert lpips")
+        raise LpipsError(f"{path}: no such LPIPS weights; make them with rsjax convert lpips")
     try:
         with safe_open(path, framework="numpy") as file:
             net = (file.metadata() or {}).get("net")

@@ -223,7 +223,7 @@ def read_tokenizer_config(directory: Path) -> TokenizerConfig:
         UserError: the settings are missing, damaged or of another version.
     """
     path = directory / "config.json"
-    settings = read_json(path, cure="make it with python -m experiments.convert")
+    settings = read_json(path, cure="make it with rsjax convert")
     if "tokenizer" not in settings:
         raise UserError(f"{directory}: holds no tokenizer/weights with their settings in config.json")
     try:

@@ -171,7 +171,7 @@ def render(description: Description) -> Group:
     table.add_column("", justify="right")
     for name, value in description.figures.items():
         table.add_row(_title(name), f"{value:,}", _short(name, value))
-    return Group(*trees, table, f"On accelerators: python -m experiments.compile {description.name} --target h100x8")
+    return Group(*trees, table, f"On accelerators: rsjax compile {description.name} --target h100x8")
 
 
 def _grow(tree: Tree, shapes: Shapes) -> None:

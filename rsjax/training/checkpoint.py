@@ -240,7 +240,7 @@ def load_weights(path: Path, like: Tree) -> Tree:
         CheckpointError: the parameters are missing or damaged, or have another architecture.
     """
     if not path.exists():
-        raise CheckpointError(f"{path}: no such weights; train first (python -m experiments.train)")
+        raise CheckpointError(f"{path}: no such weights; train first (rsjax train)")
     if (path / CHECKSUMS).exists() and (fault := find_fault(path)):
         raise _pointer(path) or CheckpointError(
             f"{path}: is damaged ({fault}); restore it from a copy, or delete it and make it again: a training makes "

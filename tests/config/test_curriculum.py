@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from experiments.cli import parse
 from rsjax.config import (
     ComponentConfig,
     Config,
@@ -22,6 +21,7 @@ from rsjax.config import (
     to_dict,
 )
 from rsjax.config.curriculum import read_curriculum, write_curriculum
+from rsjax.tools.commands.cli import parse
 from tests.curricula import PAPER, mixed, stage
 
 WORDS = st.text(min_size=1, max_size=5)

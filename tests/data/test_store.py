@@ -193,7 +193,7 @@ def test_only_what_holds_shards_is_to_be_deleted(path: Path, tmp_path: Path, man
             (place / MANIFEST).write_text(manifest)
     with pytest.raises(StoreError, match=f"delete {path} and make it again"):
         open_store(path)
-    with pytest.raises(StoreError, match=r"; give a store, or make one with experiments.ingest") as caught:
+    with pytest.raises(StoreError, match=r"; give a store, or make one with rsjax ingest") as caught:
         open_store(theirs)
     assert "delete" not in str(caught.value)
     if manifest is None:

@@ -13,12 +13,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from experiments.cli import main_errors
 from rsjax.config import AdamW, LoopConfig
 from rsjax.data.loader import Arrays, batches
 from rsjax.data.quarantine import NAME as QUARANTINE
 from rsjax.data.store import open_store, write_store
 from rsjax.files import write_atomically
+from rsjax.tools.commands.cli import main_errors
 from rsjax.trainable import StepContext, Term
 from rsjax.training.checkpoint import save_weights
 from tests.training import toy

@@ -7,12 +7,12 @@ import jax
 import numpy as np
 import pytest
 
-from experiments import store as command
 from rsjax.data.normalization import Normalization
 from rsjax.data.quarantine import read_quarantine
 from rsjax.data.shift import moved
 from rsjax.data.store import Store, StoreError
 from rsjax.tokenizers.tokenize import fingerprint, tokenize_store
+from rsjax.tools.commands import store as command
 from rsjax.tools.pipeline.run import Run
 from tests.tools.pipeline import toy
 from tests.tools.pipeline.damage import damage

@@ -11,13 +11,13 @@ import jax.numpy as jnp
 import pytest
 from rich.console import Console
 
-from experiments import describe as command
 from rsjax.config import Config, presets
 from rsjax.config.config_fields import with_values
 from rsjax.models.base import create_model
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.objective import Batch
 from rsjax.models.roboscape.transformer import empty_cache
+from rsjax.tools.commands import describe as command
 from rsjax.tools.describe import activation_bytes, count, describe, render
 from rsjax.trainable import StepContext
 from rsjax.training.state import create_state

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import yaml
 
-from experiments.cli import parse
-from experiments.train import Options
+from rsjax.tools.commands.cli import parse
+from rsjax.tools.commands.train import Options
 from rsjax.training import distributed
 from rsjax.training.checkpoint import Checkpoints
 from rsjax.training.distributed import HostsError

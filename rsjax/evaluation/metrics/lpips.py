@@ -1,6 +1,6 @@
 """LPIPS of frames (Zhang et al. 2018, version 0.1) with AlexNet and VGG16; RoboScape does not say which one it uses.
 
-The weights are files in ``eval.weights`` that ``python -m experiments.convert lpips`` makes; without its file, a metric
+The weights are files in ``eval.weights`` that ``rsjax convert lpips`` makes; without its file, a metric
 is unavailable.
 """
 
@@ -63,7 +63,7 @@ def advice(settings: EvalConfig) -> str:
 def how_to_get(net: str) -> str:
     """Returns the command that makes a network's file in the default directory."""
     word = FILES[net].removeprefix("lpips_").removesuffix(".safetensors")
-    return f"python -m experiments.convert lpips --net {word}"
+    return f"rsjax convert lpips --net {word}"
 
 
 def _frames(scene: Scene, net: str) -> PerFrame:

@@ -58,7 +58,7 @@ class CausalVAETraining(distributions.PosteriorTraining):
         require(
             self.train.steps > 0 or bool(self.train.start_from),
             "tokenizer_train.steps is 0, so the autoencoder stays as it is saved, but tokenizer_train.start_from is "
-            "empty; name the directory that python -m experiments.convert cogvideox made",
+            "empty; name the directory that rsjax convert cogvideox made",
         )
 
     @classmethod

@@ -70,7 +70,7 @@ def latent_frames(frames: int) -> int:
 class TextConfig:
     """How the model knows a clip's task: embeddings of its words from a file, or learned tokens."""
 
-    file: str = ""  # embeddings of the tasks, made by python -m experiments.convert text; empty: learned tokens
+    file: str = ""  # embeddings of the tasks, made by rsjax convert text; empty: learned tokens
     tokens: int = 226
     width: int = 4096
     tasks: tuple[str, ...] = ()  # tasks with learned tokens of their own; empty: all clips share the same tokens

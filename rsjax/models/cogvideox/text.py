@@ -1,6 +1,6 @@
 """Reads and writes files of text embeddings, and finds the text of each clip.
 
-A file of ``python -m experiments.convert text`` has a tensor ``embeddings``, (texts, tokens, width). Its metadata lists
+A file of ``rsjax convert text`` has a tensor ``embeddings``, (texts, tokens, width). Its metadata lists
 the texts in the same order; the first text is empty. Learned tokens are numbered in the same way.
 """
 
@@ -24,7 +24,7 @@ from rsjax.progress import note
 EMBEDDINGS = "embeddings"
 TEXTS = "texts"
 EMPTY = ""
-CURE = "make it with python -m experiments.convert text, and name it with --model.text.file"
+CURE = "make it with rsjax convert text, and name it with --model.text.file"
 
 
 class Texts(NamedTuple):

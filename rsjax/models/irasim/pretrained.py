@@ -85,7 +85,7 @@ def completed(fresh: Params, saved: Params) -> Params:
 
 
 def _section(directory: Path, name: str, kind: type[C], stage: str, command: str) -> C | Config:
-    cure = f"make it with python -m experiments.convert {command}"
+    cure = f"make it with rsjax convert {command}"
     if not (directory / stage / "weights").exists():
         raise UserError(f"{directory}: holds no {stage}/weights with their settings in config.json; {cure}")
     path = directory / "config.json"

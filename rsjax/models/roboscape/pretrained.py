@@ -42,7 +42,7 @@ def read_architecture(directory: Path) -> Architecture:
         UserError: the settings are missing, damaged, of another version or of another family.
     """
     path = directory / "config.json"
-    settings = read_json(path, cure="make it with python -m experiments.convert")
+    settings = read_json(path, cure="make it with rsjax convert")
     check_family(path, settings, (RoboScapeConfig.family, GenieConfig.family))
     if not settings.keys() & {"architecture", "model"}:
         raise UserError(f"{directory}: holds no world_model/weights with their settings in config.json")

@@ -1,4 +1,4 @@
-"""Imports public checkpoints and exports weights under public names. ``python -m experiments.convert --help``"""
+"""Imports public checkpoints and exports weights under public names. ``rsjax convert --help``"""
 
 from rsjax.runtime import answer_while_importing
 

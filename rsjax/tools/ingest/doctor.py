@@ -524,9 +524,9 @@ def select(source: EpisodeSource, path: Path) -> Selected:
         reasons = {_key(entry): "; ".join(map(str, entry["reasons"])) for entry in content["left_out"]}
         listed = {*reasons, *map(_key, content["kept"])}
     except FileNotFoundError as error:
-        raise SourceError(f"{path}: not there; make it with experiments.doctor … --fix {path.name}") from error
+        raise SourceError(f"{path}: not there; make it with rsjax doctor … --fix {path.name}") from error
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise SourceError(f"{path}: not a list of experiments.doctor ({error}); make it again with --fix") from error
+        raise SourceError(f"{path}: not a list of rsjax doctor ({error}); make it again with --fix") from error
     names = {name for name, _ in listed}
     known = False
     for ref in source.episodes():
@@ -536,7 +536,7 @@ def select(source: EpisodeSource, path: Path) -> Selected:
     if known:
         raise SourceError(
             f"{path}: the data set was read with other options then, or all its files have changed; run "
-            f"experiments.doctor --fix again, with the same --option"
+            f"rsjax doctor --fix again, with the same --option"
         )
     raise SourceError(f"{path}: names no episode of this data set; give the list that was made for it")
 

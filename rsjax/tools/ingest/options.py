@@ -20,7 +20,7 @@ if TYPE_CHECKING:  # loaded only when needed: --help needs none of them
 
 @dataclass(frozen=True)
 class IngestOptions:
-    """Options of ``experiments.ingest``."""
+    """Options of ``rsjax ingest``."""
 
     out: Path | None = None
     """The store; data/SOURCE by default."""
@@ -37,7 +37,7 @@ class IngestOptions:
     points: int = 256
     """Number of tracks of a clip."""
     selection: Path | None = None
-    """A list written by experiments.doctor --fix: the episodes that it leaves out are quarantined with its reasons."""
+    """A list written by rsjax doctor --fix: the episodes that it leaves out are quarantined with its reasons."""
     camera: str = ""
     """The camera to use; the episode's first by default."""
     difficulty: tuple[str, ...] = ()

@@ -41,7 +41,7 @@ def check_batch(config: Config, loop: TrainConfig, stage: Literal["tokenizer", "
         raise UserError(
             f"{section}.batch_size is {loop.batch_size}, whose activations take more than {needed / GIB:,.0f} GiB on "
             f"each of {jax.device_count()} devices with {there / GIB:,.0f} GiB; lower it, or raise "
-            f"{section}.accumulate (experiments.describe estimates the bytes of a clip)"
+            f"{section}.accumulate (rsjax describe estimates the bytes of a clip)"
         )
 
 

@@ -9,7 +9,7 @@ from rsjax.data.store import MANIFEST, StoreError, open_store
 
 
 def on_store(config: Config, path: Path) -> Config:
-    """Returns the configuration with its training data replaced by a store made by ``experiments.ingest``.
+    """Returns the configuration with its training data replaced by a store made by ``rsjax ingest``.
 
     Image size, token grid and action width follow from the store's clips.
 
@@ -23,7 +23,7 @@ def on_store(config: Config, path: Path) -> Config:
     if manifest.get("kind") != "clips" or not manifest.get("key"):
         raise StoreError(
             f"{where}: is of {manifest.get('kind')}, key {manifest.get('key')}; name a store of clips that "
-            f"experiments.ingest or rsjax.write_store made"
+            f"rsjax ingest or rsjax.write_store made"
         )
     counts = {split: len(store.source(split)) if split in store.splits else 0 for split in ("train", "test")}
     if not counts["train"] or counts["test"] < 2:

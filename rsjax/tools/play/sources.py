@@ -96,7 +96,7 @@ def reasons(run: PlayRun) -> dict[str, str]:
     if config.data is not None or config.sim.env != "lift":
         why["planner"] = "planning needs a run on the simulated Lift"
     elif _energy(run) == "judge" and not (run.data.run / FOLDER / FILE).exists():
-        why["planner"] = f"the run has no judge; python -m experiments.judge {run.data.run} trains one"
+        why["planner"] = f"the run has no judge; rsjax judge {run.data.run} trains one"
     return why
 
 

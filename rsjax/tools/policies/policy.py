@@ -81,7 +81,7 @@ def load_policy(directory: Path) -> Policy:
     """
     path = directory / FILE
     if not path.exists():
-        raise UserError(f"{path}: missing, so {directory} holds no policy; experiments.policy_learning trains some")
+        raise UserError(f"{path}: missing, so {directory} holds no policy; rsjax policy_learning trains some")
     try:
         values = read_json(path, cure="train the policy again")
         config = from_dict(PolicyConfig, values["config"])

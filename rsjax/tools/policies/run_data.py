@@ -138,13 +138,13 @@ class RunData:
 
 
 def synthetic_demos(path: Path, run: Path) -> Demos:
-    """Returns the demonstrations that ``experiments.synthesize`` made.
+    """Returns the demonstrations that ``rsjax synthesize`` made.
 
     Raises:
         UserError: there are none.
     """
     if not path.exists():
-        raise UserError(f"{path}: not there; make synthetic demonstrations with python -m experiments.synthesize {run}")
+        raise UserError(f"{path}: not there; make synthetic demonstrations with rsjax synthesize {run}")
     return load_demos(open_store(path), ["train"])
 
 

@@ -65,7 +65,7 @@ def add_result(root: Path, study: Path, claim: str, name: str = "") -> Path:
     """Copies what a study measured for a claim to the files of results, and returns the new file.
 
     Args:
-        study: a directory of ``experiments.paper``.
+        study: a directory of ``rsjax paper``.
         name: the new file's name; empty: the claim's.
 
     Raises:
@@ -74,7 +74,7 @@ def add_result(root: Path, study: Path, claim: str, name: str = "") -> Path:
     source = study / RESULTS / f"{claim}.json"
     if not source.exists():
         known = [path.stem for path in (study / RESULTS).glob("*.json")]
-        raise UserError(f"{source}: no such file{did_you_mean(claim, known)} (experiments.paper writes it)")
+        raise UserError(f"{source}: no such file{did_you_mean(claim, known)} (rsjax paper writes it)")
     path = root / DATA / f"{name or claim}.json"
     for suffix in (".json", ".npz"):
         path.with_suffix(suffix).unlink(missing_ok=True)

@@ -52,7 +52,7 @@ def write_runs(path: Path, runs: Sequence[Run]) -> None:
     for run in runs:
         found = read_metrics(run)
         if found is None:
-            raise UserError(f"{run.directory}: not a finished run; finish it with experiments.train")
+            raise UserError(f"{run.directory}: not a finished run; finish it with rsjax train")
         require(
             _without_seeds(asdict(run.config)) == _without_seeds(asdict(runs[0].config)),
             f"{run.directory} has another configuration than {runs[0].directory}; give runs that differ in their seeds",

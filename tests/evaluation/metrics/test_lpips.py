@@ -87,9 +87,7 @@ def test_the_metric_is_the_public_definition_over_predicted_frames(net: str, fil
 def test_without_weights_or_room_there_is_a_reason_and_no_number(net: str, files: dict[str, Path]) -> None:
     function = metrics()[METRICS[net]].function
     assert function is not None
-    with pytest.raises(
-        Unavailable, match=rf"^no {FILES[net]} in eval.weights: python -m experiments.convert lpips --net"
-    ):
+    with pytest.raises(Unavailable, match=rf"^no {FILES[net]} in eval.weights: rsjax convert lpips --net"):
         function(scene(EvalConfig(weights="")))
     with pytest.raises(Unavailable, match=f"frames of 15 pixels; LPIPS with {net} needs"):
         function(scene(EvalConfig(weights=str(files[net].parent)), side=15))
@@ -111,7 +109,7 @@ def test_advice_is_given_until_a_file_is_there(files: dict[str, Path], tmp_path:
     assert advice(EvalConfig(weights="")) == ""
     assert advice(EvalConfig(weights=str(files["alexnet"].parent))) == ""
     line = advice(EvalConfig(weights=str(tmp_path)))
-    assert "python -m experiments.convert lpips --net alex gets them" in line
+    assert "rsjax convert lpips --net alex gets them" in line
     assert len(line.splitlines()) == 1
 
 

@@ -84,6 +84,6 @@ def test_training_starts_from_more_context_or_without_actions(config: Config, tm
 
 
 def saved_by(directory: Path, model: IVideoGPTConfig, size: int, actions: int) -> None:
-    """Writes the settings that ``python -m experiments.convert`` would."""
+    """Writes the settings that ``rsjax convert`` would."""
     inputs = {"image_size": size, "action_dim": actions}
     (directory / "config.json").write_text(json.dumps({"model": to_dict(model), "inputs": inputs}))

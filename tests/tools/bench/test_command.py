@@ -6,8 +6,8 @@ from typing import Any
 import jax
 import pytest
 
-from experiments import bench as command
 from rsjax.tools.bench import parts
+from rsjax.tools.commands import bench as command
 
 
 @pytest.fixture(autouse=True)
@@ -55,7 +55,7 @@ def test_errors_are_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Cap
 def test_torch_needs_the_folder_of_rivals_and_says_so(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(command, "__file__", str(tmp_path / "experiments" / "bench.py"))
+    monkeypatch.setattr(command, "__file__", str(tmp_path / "rsjax" / "tools" / "commands" / "bench.py"))
     with pytest.raises(SystemExit, match="2"):
         call(monkeypatch, "debug", "--torch")
     assert "--torch needs the folder benchmarks/ of a checkout" in capsys.readouterr().err

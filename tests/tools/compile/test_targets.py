@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from experiments.compile import enter_environment
 from rsjax.config import ConfigError
 from rsjax.errors import UserError
+from rsjax.tools.commands.compile import enter_environment
 from rsjax.tools.compile.cards import CARDS
 from rsjax.tools.compile.report import largest_batch
 from rsjax.tools.compile.targets import find

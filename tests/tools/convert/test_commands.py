@@ -10,8 +10,8 @@ import jax
 import numpy as np
 import pytest
 
-from experiments.convert import main
 from rsjax.tokenizers.lpips import load_lpips
+from rsjax.tools.commands.convert import main
 from rsjax.tools.convert import files
 from rsjax.tools.convert.directory import load_tokenizer, load_world_model, save
 from rsjax.tools.convert.files import read_tensors, write_safetensors

@@ -55,7 +55,7 @@ def test_a_run_directory_is_never_written_to(tmp_path: Path) -> None:
 def test_what_is_missing_or_damaged_is_named(load: Callable[[Path], Any], tmp_path: Path) -> None:
     path = tmp_path / "config.json"
     for text, message in (
-        (None, "config.json: missing; make it with python -m experiments.convert"),
+        (None, "config.json: missing; make it with rsjax convert"),
         ("{", str(path)),
         ("[]", str(path)),
         ("{}", f"{tmp_path}: holds no (world_model|tokenizer)/weights with their settings"),

@@ -13,8 +13,8 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from experiments.convert import main
 from rsjax.tokenizers.lpips import NETS, load_lpips, lpips_shapes
+from rsjax.tools.commands.convert import main
 from rsjax.tools.convert.files import ConvertError
 from rsjax.tools.convert.lpips_package import CONSTRUCTORS, PACKAGE, Package, convert, download, load_arrays, read
 

@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 import pytest
 
-from experiments import doctor, ingest, inspect, store
 from rsjax.data.store import open_store
+from rsjax.tools.commands import doctor, ingest, inspect, store
 from rsjax.tools.ingest.options import source_options
 from rsjax.tools.ingest.summary import QUARANTINE
 from tests.bridge import BRIDGE, needs_bridge
@@ -234,7 +234,7 @@ def test_a_damaged_store_is_inspected_and_the_status_says_so(command: Command, t
         (
             ingest,
             ["folder", ".", "--selection", "nowhere.json"],
-            "nowhere.json: not there; make it with experiments.doctor",
+            "nowhere.json: not there; make it with rsjax doctor",
         ),
         (ingest, ["folder", ".", "--windows.frames", "1"], "windows.frames is 1"),
         (ingest, ["folder", ".", "--image-size", "1000000"], "--image-size is 1000000"),
@@ -245,7 +245,7 @@ def test_a_damaged_store_is_inspected_and_the_status_says_so(command: Command, t
         (inspect, ["nowhere", "--records", "-1"], "inspect.records is -1; it must be at least 1"),
         (inspect, ["nowhere", "--clips", "0"], "inspect.clips is 0; it must be at least 1"),
         (ingest, ["sim", "tests"], "tests: no store (it has no manifest.json); give a store, or make one"),
-        (doctor, [], "usage: python -m experiments.doctor STORE, or python -m experiments.doctor SOURCE PATH"),
+        (doctor, [], "usage: rsjax doctor STORE, or rsjax doctor SOURCE PATH"),
         (store, [], "usage"),
         (store, ["merge", "a", "b"], "merging takes two stores or more"),
         (store, ["split", "--by", "task"], "missing STORE"),

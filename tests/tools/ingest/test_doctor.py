@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from experiments import doctor as command
 from rsjax.config import ConfigError
 from rsjax.processes import WorkerDied
+from rsjax.tools.commands import doctor as command
 from rsjax.tools.ingest import doctor
 from rsjax.tools.ingest.doctor import KINDS, Thresholds, diagnose, open_any, quaternions, select, write_selection
 from rsjax.tools.ingest.episode import Episode, EpisodeError, Segment, SourceError

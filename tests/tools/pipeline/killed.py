@@ -8,8 +8,8 @@ import signal
 import sys
 from typing import Any
 
-from experiments.train import main
 from rsjax.tokenizers import tokenize
+from rsjax.tools.commands.train import main
 from rsjax.training.checkpoint import Checkpoints
 
 

@@ -10,7 +10,6 @@ import jax
 import numpy as np
 import pytest
 
-from experiments import compare as compare_command
 from rsjax.config import Config, presets, to_dict
 from rsjax.data.normalization import Normalization
 from rsjax.data.store import Store
@@ -27,6 +26,7 @@ from rsjax.files import write_json
 from rsjax.models.trained import TrainedModel
 from rsjax.runtime import HUGE_PAGES
 from rsjax.tokenizers.magvit2 import Tokenizer
+from rsjax.tools.commands import compare as compare_command
 from rsjax.tools.pipeline import evaluation_clips as eval_clips
 from rsjax.tools.pipeline import evaluations
 from rsjax.tools.pipeline.evaluation_clips import evaluation_store, longer_episodes, probes_of

@@ -11,8 +11,6 @@ import cv2
 import numpy as np
 import pytest
 
-from experiments import train
-from experiments.cli import parse
 from rsjax.config import ConfigError, RoboScapeConfig, presets
 from rsjax.data.normalization import Normalization
 from rsjax.data.store import Store, StoreError, encode_clip, open_store, write_store
@@ -21,6 +19,8 @@ from rsjax.evaluation.metrics.depth import depth_scores
 from rsjax.models.base import create_model
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.tokenizers.tokenize import tokenize_store
+from rsjax.tools.commands import train
+from rsjax.tools.commands.cli import parse
 from rsjax.tools.pipeline.run import Run
 from rsjax.tools.pipeline.run_clips import on_store, relocated
 from rsjax.tools.pipeline.stages import prepare

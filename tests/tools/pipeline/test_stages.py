@@ -98,4 +98,4 @@ def test_a_start_says_how_to_get_lpips_where_its_weights_may_come(
     for weights, said in (("weights", 1), ("", 0)):
         config = with_values(toy.config(), {"eval.weights": weights})
         stages.note_changes(Run(config, tmp_path / "run", tmp_path), "")
-        assert capsys.readouterr().out.count("experiments.convert lpips --net alex gets them") == said
+        assert capsys.readouterr().out.count("rsjax convert lpips --net alex gets them") == said

@@ -15,9 +15,9 @@ import jax
 import numpy as np
 import pytest
 
-from experiments import train
 from rsjax.config import presets
 from rsjax.models.load_run import load
+from rsjax.tools.commands import train
 from rsjax.tools.pipeline.run import STAGES, Run
 from rsjax.tools.sim import gl as gl_module
 from rsjax.training.log import read_log

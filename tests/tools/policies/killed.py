@@ -3,7 +3,7 @@
 ``python -m tests.tools.policies.killed RUN …``.
 """
 
-from experiments.adapt import main
+from rsjax.tools.commands.adapt import main
 from tests.tools.pipeline.killed import in_world_model
 
 if __name__ == "__main__":

@@ -6,10 +6,10 @@ from typing import Any
 
 import pytest
 
-from experiments.cli import parse_options, part
 from rsjax.config import ConfigError
 from rsjax.errors import UserError
 from rsjax.files import write_file
+from rsjax.tools.commands.cli import parse_options, part
 from rsjax.tools.policies import policy_training as training_module
 from rsjax.tools.policies.run_data import RunData
 from rsjax.tools.policies.studies import policy_learning as learning_module
@@ -22,7 +22,7 @@ from tests.tools.policies.toy import demo_store, demos
 
 
 def parsed(command: str, *words: str) -> Any:
-    module = importlib.import_module(f"experiments.{command}")
+    module = importlib.import_module(f"rsjax.tools.commands.{command}")
     return parse_options(words, command, module.Options.__doc__, module.Options())
 
 
@@ -54,7 +54,7 @@ def test_impossible_options_are_named(command: str, words: tuple[str, ...], mess
 
 
 def called(command: str, monkeypatch: pytest.MonkeyPatch, *words: object) -> None:
-    module = importlib.import_module(f"experiments.{command}")
+    module = importlib.import_module(f"rsjax.tools.commands.{command}")
     monkeypatch.setattr(module, "tune_process", lambda: None)  # it would start the tests over
     monkeypatch.setattr(sys, "argv", [command, *map(str, words)])
     module.main()

@@ -59,7 +59,7 @@ class HeadJudge:
 
 
 def head_judge(trained: TrainedModel, run: Path | None = None) -> HeadJudge:
-    """Returns the judge of a model's heads, with its validation if ``experiments.judge RUN --head`` made one.
+    """Returns the judge of a model's heads, with its validation if ``rsjax judge RUN --head`` made one.
 
     Raises:
         UserError: the model has no state heads, or the file of the validation is damaged.
@@ -73,5 +73,5 @@ def head_judge(trained: TrainedModel, run: Path | None = None) -> HeadJudge:
         )
     if run is None or not (run / FOLDER / VALIDATION).exists():
         return HeadJudge()
-    found = read_json(run / FOLDER / VALIDATION, cure="validate them again: python -m experiments.judge RUN --head")
+    found = read_json(run / FOLDER / VALIDATION, cure="validate them again: rsjax judge RUN --head")
     return HeadJudge(int(found.get("in_a_row", 1)), found)

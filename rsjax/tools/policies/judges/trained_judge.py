@@ -102,7 +102,7 @@ class TrainedJudge:
 
 
 def load_judge(folder: Path, side: int | None = None) -> TrainedJudge:
-    """Reads a judge that ``python -m experiments.judge`` trained, with its validation if that is of the same judge.
+    """Reads a judge that ``rsjax judge`` trained, with its validation if that is of the same judge.
 
     Args:
         side: of the frames that the judge will see, pixels; None: not known yet.
@@ -118,13 +118,13 @@ def load_judge(folder: Path, side: int | None = None) -> TrainedJudge:
         trained_on = int(record.pop("side"))
         in_a_row = int(record.pop("in_a_row", 1))
     except FileNotFoundError as error:
-        raise UserError(f"{path}: no judge there; train one with python -m experiments.judge RUN") from error
+        raise UserError(f"{path}: no judge there; train one with rsjax judge RUN") from error
     except (OSError, ValueError, KeyError) as error:
-        raise UserError(f"{path}: damaged ({error}); train it again with python -m experiments.judge RUN") from error
+        raise UserError(f"{path}: damaged ({error}); train it again with rsjax judge RUN") from error
     if side not in (None, trained_on):
         raise UserError(
             f"{path}: was trained on frames of {trained_on} × {trained_on} pixels, these have {side} × {side}; train "
-            f"one on such frames with python -m experiments.judge RUN"
+            f"one on such frames with rsjax judge RUN"
         )
     params = unflatten_dict({tuple(name.split("/")): x for name, x in record.items()})
     judge = TrainedJudge(params, temperature, trained_on, in_a_row=in_a_row)

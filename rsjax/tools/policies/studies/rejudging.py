@@ -98,9 +98,7 @@ def rejudge(out: Path, judge: Judge, name: str) -> Path:
 
 def _results(out: Path) -> dict[str, Any]:
     file = out / "results.json"
-    results: dict[str, Any] = read_json(
-        file, cure="compare policies first: python -m experiments.policy_evaluation RUN"
-    )
+    results: dict[str, Any] = read_json(file, cure="compare policies first: rsjax policy_evaluation RUN")
     return results
 
 

@@ -45,7 +45,7 @@ class EnvironmentSettings:
         split: the clips whose first frames episodes begin with.
         max_steps: steps after which an episode is truncated; it may be longer than the model's window.
         judge: decides reward and termination: a judge, the directory of a trained one, "run" for the judge that
-            ``experiments.judge`` trained for the run, if any, or "head" for the model's own success head. Without a
+            ``rsjax judge`` trained for the run, if any, or "head" for the model's own success head. Without a
             judge, every reward is 0.
         out_of_range: whether actions outside the action space are clipped and counted ("clip"), or raise ("refuse").
     """
@@ -128,7 +128,7 @@ class WorldModelEnv(gymnasium.Env[Any, Any]):
     When the judge says "success", the reward is 1 and the episode terminates.
 
     Args:
-        run: a run directory of experiments.train, or a model that ``rsjax.load`` loaded.
+        run: a run directory of rsjax train, or a model that ``rsjax.load`` loaded.
         render_mode: "rgb_array", or None.
         settings: fields of :class:`EnvironmentSettings`.
 
@@ -215,7 +215,7 @@ class WorldModelVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
     mode). The values in ``info`` are arrays over the environments.
 
     Args:
-        run: a run directory of experiments.train, or a model that ``rsjax.load`` loaded.
+        run: a run directory of rsjax train, or a model that ``rsjax.load`` loaded.
         num_envs: the number of environments.
         settings: fields of :class:`EnvironmentSettings`.
 

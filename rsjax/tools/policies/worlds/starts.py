@@ -29,7 +29,7 @@ class Starts:
 
     Attributes:
         config: the run's configuration.
-        run, data_dir, store: where its clips are, as for ``experiments.generate``.
+        run, data_dir, store: where its clips are, as for ``rsjax generate``.
         split: the clips to choose from.
         depth: whether a first frame needs depth.
     """

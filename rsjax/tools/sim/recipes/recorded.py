@@ -1,4 +1,4 @@
-"""Episodes of policies as they act in the simulator, recorded by ``experiments.record`` and simulated once more.
+"""Episodes of policies as they act in the simulator, recorded by ``rsjax record`` and simulated once more.
 
 Only their starts and actions are used, so that frames, depth and tracks are those of the configuration at hand.
 """
@@ -96,6 +96,6 @@ def _episodes(store: Path) -> list[Episode]:
         origin = record["provenance"]
         manner = origin.get("expert")
         if not isinstance(manner, dict) or manner.get("mode") != POLICY:
-            raise UserError(f"{store}: its clips are not of policies in the simulator; make it with experiments.record")
+            raise UserError(f"{store}: its clips are not of policies in the simulator; make it with rsjax record")
         episodes.append(Episode(origin["seed"], origin["episode"], manner["policy"], record["actions"]))
     return episodes

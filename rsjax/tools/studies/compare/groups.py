@@ -110,7 +110,7 @@ def _common(runs: Sequence[Path]) -> str:
     common = set.intersection(*(set(results_of(run)) for run in runs))
     chosen = sorted(common - {OWN} or common)
     labels = " ".join(map(str, runs))
-    require(bool(chosen), f"no protocol has evaluated all of them; python -m experiments.evaluate {labels}")
+    require(bool(chosen), f"no protocol has evaluated all of them; rsjax evaluate {labels}")
     require(len(chosen) == 1, f"all of them have results of {' and of '.join(chosen)}; choose one with --protocol")
     return chosen[0]
 
@@ -123,7 +123,7 @@ def _folder(run: Path, label: str) -> Path:
         has = f"it has {', '.join(found)}" if found else "it has none"
         raise UserError(
             f"{run}: no result of protocol {label}{did_you_mean(label, found)} ({has}); "
-            f"python -m experiments.evaluate {run} --protocol {label.partition(',')[0]}"
+            f"rsjax evaluate {run} --protocol {label.partition(',')[0]}"
         )
     return found[label]
 
@@ -139,7 +139,7 @@ def check_alike(groups: Sequence[Group]) -> None:
         if lines:
             raise UserError(
                 f"{name} ({first.model['run']}) and {other} ({result.model['run']}) were not evaluated alike: "
-                f"{'; '.join(lines)}; evaluate both by one protocol on the same clips (python -m experiments.evaluate)"
+                f"{'; '.join(lines)}; evaluate both by one protocol on the same clips (rsjax evaluate)"
             )
 
 

@@ -1,1 +1,1 @@
-"""Tests the paper's claims at small scale: ``python -m experiments.paper`` trains, measures and judges each."""
+"""Tests the paper's claims at small scale: ``rsjax paper`` trains, measures and judges each."""

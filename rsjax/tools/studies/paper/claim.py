@@ -156,7 +156,7 @@ _CLAIMS: dict[str, Claim] = {}
 
 
 def register(claim: Claim) -> Claim:
-    """Adds a claim to those of ``experiments.paper``, and returns it.
+    """Adds a claim to those of ``rsjax paper``, and returns it.
 
     Raises:
         ConfigError: another claim has the same name.

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import UInt8
 
-from experiments.cli import main_errors
 from rsjax.errors import UserError
+from rsjax.tools.commands.cli import main_errors
 from rsjax.tools.ingest.annotators.choose import METHODS, choose
 from rsjax.tools.ingest.annotators.protocols import ShotDetector
 from rsjax.tools.ingest.formats import FORMATS, open_source

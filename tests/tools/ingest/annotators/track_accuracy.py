@@ -10,10 +10,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
-from experiments.cli import main_errors
 from rsjax.clip import Clip
 from rsjax.data.depth_color import Scale, color_to_depth, depth_to_color
 from rsjax.data.store import open_store
+from rsjax.tools.commands.cli import main_errors
 from rsjax.tools.ingest.annotators.tracks import Follower, LucasKanade
 
 

@@ -65,7 +65,7 @@ def test_a_judge_comes_back_from_its_file_and_damage_is_named(judge: TrainedJudg
         assert (load_judge(tmp_path / "judge").validation is not None) == known
     np.testing.assert_allclose(judge(frames).sum(-1), 1, rtol=1e-5)
     np.testing.assert_array_equal(judge(frames), judge(frames[:, -HISTORY:]))
-    with pytest.raises(UserError, match="no judge there; train one with python -m experiments.judge"):
+    with pytest.raises(UserError, match="no judge there; train one with rsjax judge"):
         load_judge(tmp_path)
     (tmp_path / "judge" / "judge.msgpack").write_bytes(b"nonsense")
     with pytest.raises(UserError, match="damaged"):

@@ -264,7 +264,7 @@ def test_a_comparison_resumes_and_counts(model: TrainedModel, tmp_path: Path, mo
     assert keys[0] == keys[1] != keys[2]
     assert compare(model, tmp_path, SimulatorWorld([], 4, 7), settings) == result  # no episode is run again
     assert (place / "result.json").read_text() == saved
-    with pytest.raises(UserError, match="no judge there; train one with python -m experiments.judge"):
+    with pytest.raises(UserError, match="no judge there; train one with rsjax judge"):
         compare(model, tmp_path, lift(), replace(settings, energy="judge"))
     with pytest.raises(ConfigError, match="needs lpips_weights"):
         replace(settings, energy="lpips")

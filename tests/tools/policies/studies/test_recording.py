@@ -55,4 +55,4 @@ def test_clips_that_no_policy_made_are_no_recordings(tmp_path: Path) -> None:
     store = demo_store(tmp_path / "demos")
     with pytest.raises(UserError) as refused:
         training_plans(replace(CONFIG, recipe=(f"recorded:{store.path}",)))
-    assert "its clips are not of policies in the simulator; make it with experiments.record" in str(refused.value)
+    assert "its clips are not of policies in the simulator; make it with rsjax record" in str(refused.value)

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments import ablation
 from rsjax.data.token_sets import OWN
 from rsjax.errors import Preempted, UserError
 from rsjax.files import lock
+from rsjax.tools.commands import ablation
 from rsjax.tools.pipeline import stages
 from rsjax.tools.pipeline.run import STAGES, Run, link
 from rsjax.tools.studies.ablation import sweep

@@ -268,8 +268,8 @@ def test_a_missing_result_names_the_command(make: Make, tmp_path: Path) -> None:
     toy.run(tmp_path / "both,seed=0", replace(toy.result(0.0), label="horizon48"))
     toy.run(tmp_path / "b", replace(toy.result(0.0), label="unseen,unseen_camera"))
     for group, protocol, message in (
-        (make("a", toy.result(0.0)), "papr", "no result of protocol papr; did you mean 'paper'.*experiments.evaluate"),
-        (f"{tmp_path}/bare", None, "no protocol has evaluated all of them; python -m experiments.evaluate"),
+        (make("a", toy.result(0.0)), "papr", "no result of protocol papr; did you mean 'paper'.*rsjax evaluate"),
+        (f"{tmp_path}/bare", None, "no protocol has evaluated all of them; rsjax evaluate"),
         (both, None, "results of horizon48 and of paper; choose one with --protocol"),
         (f"{tmp_path}/b", "unseen", "no result unseen, but unseen,unseen_camera; choose one of them with --proto"),
     ):

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from experiments import paper
 from rsjax.clip import Video
 from rsjax.config import presets
 from rsjax.config.config_fields import with_values
@@ -20,6 +19,7 @@ from rsjax.errors import Preempted
 from rsjax.evaluation.registry import Unavailable
 from rsjax.evaluation.statistics import Verdict
 from rsjax.runtime import HUGE_PAGES
+from rsjax.tools.commands import paper
 from rsjax.tools.pipeline import stages
 from rsjax.tools.pipeline.run import Run
 from rsjax.tools.studies.ablation import sweep

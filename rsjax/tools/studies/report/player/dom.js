@@ -1,4 +1,4 @@
-// Builds elements and icons. Shared by the report's player and the page of experiments.play.
+// Builds elements and icons. Shared by the report's player and the page of rsjax play.
 
 const ICONS = {
   play: "M8 5v14l11-7z",

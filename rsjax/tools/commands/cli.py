@@ -77,7 +77,7 @@ class PresetOptions:
     model: str | None = None
     """The model's family (roboscape, genie, ivideogpt, irasim, cogvideox); settings that both families have stay."""
     store: Path | None = None
-    """A store of clips made by experiments.ingest, to train on instead of simulated clips."""
+    """A store of clips made by rsjax ingest, to train on instead of simulated clips."""
 
     def apply(self, preset: Config) -> Config:
         """Returns the preset changed by these options."""
@@ -95,7 +95,7 @@ def parse(argv: Sequence[str], prog: str, description: str, options: Options) ->
 
     Args:
         argv: the arguments, without the program's name.
-        prog: the command as the user types it, ``python -m experiments.train``.
+        prog: the command as the user types it, ``rsjax train``.
         description: what the command does, for ``--help``.
         options: a dataclass of the command's own options, with their defaults.
 

@@ -12,10 +12,10 @@ import tyro
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from experiments.cli import FIRST_FIELDS, main_errors, parse, parse_options
 from rsjax.config import Config, ConfigError, LossConfig, PublicCodeConfig, presets
 from rsjax.config.config_fields import with_values
 from rsjax.errors import UserError, did_you_mean
+from rsjax.tools.commands.cli import FIRST_FIELDS, main_errors, parse, parse_options
 
 
 @dataclasses.dataclass(frozen=True)

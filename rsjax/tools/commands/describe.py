@@ -1,0 +1,32 @@
+"""Describes a preset: modules, parameters, operations, memory. ``rsjax describe roboscape_s``"""
+
+import json
+import sys
+from dataclasses import dataclass
+
+from rsjax.tools.commands.cli import main_errors, parse
+
+PROG = "rsjax describe"
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of this command."""
+
+    json: bool = False
+    """Print the numbers as one JSON object instead."""
+
+
+@main_errors()
+def main() -> None:
+    """Prints the description."""
+    config, options = parse(sys.argv[1:], PROG, "Counts parameters, operations and memory, from shapes.", Options())
+    from rich.console import Console
+
+    from rsjax.tools.describe import describe, render
+
+    description = describe(config)
+    if options.json:
+        print(json.dumps({"preset": description.name} | description.figures, indent=1))
+    else:
+        Console().print(render(description))

@@ -1,0 +1,59 @@
+"""Records policies in the simulator. ``rsjax record runs/tiny --policies DIR … --episodes 25``"""
+
+import sys
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from rsjax.config import ConfigError
+from rsjax.runtime import tune_process
+from rsjax.tools.commands.cli import main_errors, parse_options
+
+FIRST = 1_000_000  # number of the first episode; those of rsjax adapt are smaller
+
+
+@dataclass(frozen=True)
+class Options:
+    """Records episodes of policies in the simulator, as the recipe recorded:PATH takes them (docs/simulators.md)."""
+
+    run: tyro.conf.Positional[Path] = tyro.MISSING
+    """A run directory on simulated clips, whose camera, frames and control steps the recordings have."""
+    policies: tuple[Path, ...] = ()
+    """Directories of trained policies, such as RUN/policy_evaluation/policy/at-90; they take turns."""
+    episodes: int = 25
+    """Episodes of each policy."""
+    together: int = 5
+    """Episodes that run at a time."""
+    data_dir: Path = Path("data")
+    """Directory of simulated data sets."""
+    out: Path | None = None
+    """Directory of the recordings; default RUN/recorded."""
+
+
+@main_errors()
+def main() -> None:
+    """Writes a store of the episodes and prints the recipe that takes it."""
+    tune_process()
+    options = parse_options(sys.argv[1:], "rsjax record", Options.__doc__ or "", Options())
+    if not options.policies or options.episodes < 1 or options.together < 1:
+        raise ConfigError("name a policy at least, and --episodes and --together of 1 or more: --policies DIR")
+    from rsjax.config import content_key
+    from rsjax.tools.policies.on_policy import rollouts
+    from rsjax.tools.policies.policy import common_size, load_policy
+    from rsjax.tools.policies.run_data import RunData, named
+    from rsjax.tools.policies.worlds.simulator_world import SimulatorWorld
+
+    config = RunData(options.run, options.data_dir).simulator
+    policies = {name: load_policy(place) for name, place in named(options.policies).items()}
+    common_size(policies.values())
+    total = options.episodes * len(policies)
+    numbers = {"train": range(FIRST, FIRST + total)}
+    keys = str([policy.key for policy in policies.values()])
+    folder = (options.out or options.run / "recorded") / content_key("recorded", config, keys, total)
+    with closing(SimulatorWorld.lift(config, min(options.together, options.episodes))) as world:
+        store = rollouts(policies, world, config, numbers, config.frames - 1, folder, "record")
+    share = store.manifest["success_share"]
+    print(f"{total} episodes, {100 * share:.0f} % end in success")
+    print(f"--sim.recipe expert recorded:{store.path}")
