@@ -6,7 +6,7 @@ python := $(VENV)/bin/python
 # When a test ends its process, the run ends, too: in a new process, xdist would run the same test again.
 in_parallel := -n $(JOBS) --max-worker-restart 0
 
-.PHONY: help setup train test extras accelerators accelerators-test lint clean
+.PHONY: help setup train test wheel-test extras accelerators accelerators-test lint clean
 
 help:  ## this list
 	@sed -n 's/^\([a-z-]*\):[^#]*## /make \1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 24
@@ -21,9 +21,12 @@ train: setup  ## simulate, train, generate, evaluate, report: the preset tiny
 test: setup  ## the tests
 	@$(python) -m pytest $(in_parallel) $(ARGS)
 
+wheel-test:  ## the wheel alone, in an empty environment outside the checkout: demo, generate, play
+	@scripts/wheel.sh
+
 extras: setup  ## the optional packages (networks, PyTorch, Rerun, a browser), and the tests that want them
 	@scripts/extras.sh "$(VENV)"
-	@"$(VENV)/extras/bin/python" -m pytest $(in_parallel) $$(grep -rlE --include='test_*.py' 'importorskip\("(torch|trans|rerun|playwright|stable)' tests) $(ARGS)
+	@"$(VENV)/extras/bin/python" -m pytest $(in_parallel) $$(grep -rlE --include='test_*.py' 'importorskip\("(torch|trans|rerun|playwright|stable|hugging)' tests) $(ARGS)
 
 accelerators: setup  ## compilers for GPUs and TPUs that are not here (5.1 GB), for experiments.compile
 	@scripts/accelerators.sh "$(VENV)"

@@ -1,9 +1,9 @@
 """rsjax: a world model that robots can learn in.
 
 >>> import rsjax
->>> model = rsjax.load("runs/tiny")
->>> clips = rsjax.open_store("data/lift-9c6b21215947e5ca").source("test")
->>> video = model.generate(clips[0]["rgb"][:1], clips[0]["actions"])
+>>> model = rsjax.load("tiny")
+>>> clip = rsjax.examples("tiny")[0]
+>>> video = model.generate(clip["rgb"][:1], clip["actions"])
 
 ``docs/api.md`` describes the whole API.
 """
@@ -15,28 +15,45 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
     from rsjax.clip import Clip
-    from rsjax.data.store import Store
+    from rsjax.data.store import Source, Store
     from rsjax.models.trained import TrainedModel
 
 __version__ = "0.2.0"
-__all__ = ["__version__", "load", "open_store", "write_store"]
+__all__ = ["__version__", "examples", "load", "open_store", "write_store"]
 
 
 def load(run: "Path | str") -> "TrainedModel":
-    """Loads the trained world model from a run directory that ``rsjax train`` made.
+    """Loads a trained world model.
 
     Args:
-        run: the directory, such as ``"runs/tiny"``.
+        run: ``"tiny"``, the model in the package; a directory that ``model.save`` or ``rsjax save`` wrote; or a run
+            directory of ``rsjax train``, such as ``"runs/tiny"``.
 
     Returns:
-        A model whose ``generate``, ``plan``, ``encode`` and ``decode`` take and return numpy arrays.
+        A model whose ``generate``, ``plan``, ``encode`` and ``decode`` take and return numpy arrays, and whose ``save``
+        writes it to a directory.
 
     Raises:
-        rsjax.errors.UserError: the run is missing, unfinished or damaged, or was made by another version of rsjax.
+        rsjax.errors.UserError: the model is missing, unfinished or damaged, or was made by another version of rsjax.
     """
     from rsjax.models.load_run import load as load_run  # jax is imported when it is needed, not with the package
 
     return load_run(run)
+
+
+def examples(model: "Path | str" = "tiny") -> "Source":
+    """Opens the held-out clips that lie beside a saved model, such as the one in the package.
+
+    Returns:
+        The clips: ``len(clips)``, and ``clips[0]``, a dict with the fields of :class:`rsjax.clip.Clip`.
+
+    Raises:
+        rsjax.data.store.StoreError: there are none.
+    """
+    from rsjax.data import store
+    from rsjax.model_directory import CLIPS, locate
+
+    return store.open_store(locate(model) / CLIPS).source("test")
 
 
 def open_store(path: "Path | str") -> "Store":

@@ -63,6 +63,18 @@ class Normalization:
         except (FileError, ValueError, KeyError, TypeError) as error:
             raise UserError(f"{path}: missing or damaged ({error}); the train command of this run makes it") from error
 
+    @classmethod
+    def of(cls, values: Any, path: Path) -> "Normalization":
+        """Returns the normalization with these fields, JSON-ready, which are from ``path``.
+
+        Raises:
+            UserError: a field is missing or wrong.
+        """
+        try:
+            return cls._of(values)
+        except (ValueError, KeyError, TypeError) as error:
+            raise UserError(f"{path}: its normalization is damaged ({error}); copy the model again") from error
+
     def save(self, run: Path) -> None:
         """Writes what :meth:`load` reads."""
         write_json(run / FILE, asdict(self), sealed=True)

@@ -1,4 +1,4 @@
-"""Loads a run directory's configuration, weights and trained model."""
+"""Loads configuration, weights and trained model of a run directory or a saved model."""
 
 from pathlib import Path
 
@@ -7,37 +7,37 @@ import jax
 from rsjax.config import Config, ConfigError, from_dict
 from rsjax.data.normalization import Normalization
 from rsjax.errors import UserError
-from rsjax.files import checked_path, read_json
+from rsjax.files import checked_path
+from rsjax.model_directory import SETTINGS, is_saved, load_part, locate, read_settings, saved_section
 from rsjax.models.base import Assets, create_autoencoder, create_model
 from rsjax.models.trained import TrainedModel
 from rsjax.trainable import Params
-from rsjax.training.checkpoint import load_weights
 
 
 def load(run: Path | str) -> TrainedModel:
-    """Loads the trained world model of a run directory.
+    """Loads the trained world model of a run directory or a saved model, or the one in the package of that name.
 
     Raises:
-        UserError: the run is missing, unfinished or damaged, or was made by another version of rsjax.
+        UserError: it is missing, unfinished or damaged, or was made by another version of rsjax.
     """
-    run = checked_path(run, "run")
+    run = locate(checked_path(run, "run"))
     config = load_config(run)
     model = create_model(config)
-    params = load_weights(run / "world_model" / "weights", jax.eval_shape(model.init, jax.random.key(0)))
+    params = load_part(run, "world_model", jax.eval_shape(model.init, jax.random.key(0)))
     return TrainedModel(config, model, params, load_assets(config, run))
 
 
 def load_config(run: Path) -> Config:
-    """Reads the configuration of a run directory.
+    """Reads the configuration of a run directory or a saved model.
 
     Raises:
         UserError: the configuration is missing, damaged or of another version.
     """
-    path = run / "config.json"
+    path = run / SETTINGS
     if not path.exists():
         raise UserError(f"{path}: missing, so {run} is not a run directory; make one with rsjax train")
     try:
-        return from_dict(Config, read_json(path, cure="the train command of this run writes it again"))
+        return from_dict(Config, read_settings(run, "the train command of this run writes it again"))
     except (ConfigError, TypeError) as error:
         raise UserError(
             f"{path}: not a configuration of this version of rsjax ({error}); if an older one made it, "
@@ -47,11 +47,15 @@ def load_config(run: Path) -> Config:
 
 def load_assets(config: Config, run: Path) -> Assets:
     """Loads the data that the run's world model needs in addition to its own parameters."""
-    return Assets(Normalization.load(run / "tokens"), load_tokenizer(config, run))
+    if is_saved(run):
+        normalization = Normalization.of(saved_section(run).get("normalization"), run / SETTINGS)
+    else:
+        normalization = Normalization.load(run / "tokens")
+    return Assets(normalization, load_tokenizer(config, run))
 
 
 def load_tokenizer(config: Config, run: Path) -> Params | None:
     """Loads the trained tokenizer's or autoencoder's parameters; None for a model without one."""
     if not config.model.uses_tokenizer:
         return None
-    return load_weights(run / "tokenizer" / "weights", create_autoencoder(config).shapes())
+    return load_part(run, "tokenizer", create_autoencoder(config).shapes())

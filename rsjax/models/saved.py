@@ -6,12 +6,12 @@ from typing import Any, NamedTuple, TypeVar
 from rsjax.config import Config, ConfigError, ModelConfig, from_dict
 from rsjax.config.fields import differences
 from rsjax.errors import UserError
-from rsjax.files import read_json
+from rsjax.model_directory import Part, has_weights, read_settings
 
 M = TypeVar("M", bound=ModelConfig)
 
 
-def read_model(directory: Path, kind: type[M], part: str) -> M:
+def read_model(directory: Path, kind: type[M], part: Part) -> M:
     """Returns the settings of a directory's model.
 
     Args:
@@ -22,9 +22,9 @@ def read_model(directory: Path, kind: type[M], part: str) -> M:
         UserError: the weights or their settings are missing, damaged, of another version or of another family.
     """
     path = directory / "config.json"
-    settings = read_json(path, cure="make it with rsjax convert")
+    settings = read_settings(directory, "make it with rsjax convert")
     check_family(path, settings, (kind.family,))
-    if "model" not in settings or not (directory / part / "weights").exists():
+    if "model" not in settings or not has_weights(directory, part):
         raise UserError(f"{directory}: holds no {part}/weights of a model {kind.family!r} with settings in config.json")
     try:
         saved = from_dict(ModelConfig, settings["model"])
@@ -62,7 +62,7 @@ def saved_inputs(directory: Path) -> Inputs:
         UserError: the settings are missing, damaged or of another version.
     """
     path = directory / "config.json"
-    settings = read_json(path, cure="make it with rsjax convert")
+    settings = read_settings(directory, "make it with rsjax convert")
     try:
         if "inputs" in settings:  # written by rsjax convert
             return Inputs(**{name: int(value) for name, value in settings["inputs"].items()})

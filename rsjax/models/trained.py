@@ -1,16 +1,19 @@
 """The public interface of a trained world model: numpy arrays in, numpy arrays out."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 
 from rsjax.clip import Video
-from rsjax.config import Config
+from rsjax.config import Config, to_dict
 from rsjax.errors import UserError
+from rsjax.model_directory import Dtype, Part, save_directory
 from rsjax.models.base import Assets, WorldModel
+from rsjax.models.card import model_card
 from rsjax.tokenizers.codec import Codec, Tokens
 from rsjax.trainable import Params
 
@@ -111,6 +114,30 @@ class TrainedModel:
         batch: Tokens = {name: x[None] if single else x for name, x in arrays.items()}
         video = codec.decode(batch, np.full(len(batch["rgb"]), "depth" in batch))
         return _first(video) if single else video
+
+    def save(self, directory: Path | str, dtype: Dtype = "float32", card: str = "") -> None:
+        """Writes the model as a directory that :func:`rsjax.load` and a hub take as it is (``docs/models_on_disk.md``).
+
+        An older saved model there is replaced, with all its files.
+
+        Args:
+            directory: gets ``config.json``, ``model.safetensors`` and ``README.md``.
+            dtype: ``float16`` halves the file.
+            card: the text of ``README.md``, by default a few lines on what the model takes and returns.
+
+        Raises:
+            UserError: the directory holds something else, or a parameter is too large for ``float16``.
+            FileError: the disk is full or cannot be written to.
+        """
+        directory = Path(directory)
+        settings = to_dict(self.config)
+        if self.config.data is not None:  # the name of the store is enough; its path is this machine's
+            settings["data"]["store"] = Path(self.config.data.store).name
+        parts: dict[Part, Params] = {"world_model": self.params}
+        if self.config.model.uses_tokenizer:
+            parts["tokenizer"] = self.assets.tokenizer
+        saved = {"normalization": asdict(self.assets.normalization)}
+        save_directory(directory, settings, saved, parts, dtype, card or model_card(self.config, directory.name))
 
     def _codec(self) -> Codec:
         if self.assets.tokenizer is None or self.config.model.own_autoencoder is not None:

@@ -19,7 +19,7 @@ from rsjax.data.depth_color import depth_to_color
 from rsjax.data.loader import Arrays, Transform
 from rsjax.data.normalization import Normalization
 from rsjax.errors import UserError
-from rsjax.files import read_json
+from rsjax.model_directory import has_weights, read_settings
 from rsjax.tokenizers import lfq
 from rsjax.tokenizers.adversarial import adversarial_terms, initial_averages, updated_averages
 from rsjax.tokenizers.autoencoder import Autoencoder
@@ -176,7 +176,7 @@ class TokenizerTraining(Autoencoder[Images]):
         Raises:
             UserError: the weights are missing or of another network; the message names the differing fields.
         """
-        if not (directory / "tokenizer" / "weights").exists():
+        if not has_weights(directory, "tokenizer"):
             raise UserError(f"{directory}: holds no tokenizer/weights with their settings in config.json")
         saved = read_tokenizer_config(directory)
         if differing := differences(saved, self.tokenizer, FREE):
@@ -223,7 +223,7 @@ def read_tokenizer_config(directory: Path) -> TokenizerConfig:
         UserError: the settings are missing, damaged or of another version.
     """
     path = directory / "config.json"
-    settings = read_json(path, cure="make it with rsjax convert")
+    settings = read_settings(directory, "make it with rsjax convert")
     if "tokenizer" not in settings:
         raise UserError(f"{directory}: holds no tokenizer/weights with their settings in config.json")
     try:

@@ -12,7 +12,7 @@ from flax.traverse_util import flatten_dict, unflatten_dict
 from rsjax.config import Config, ConfigError, from_dict
 from rsjax.config.fields import differences
 from rsjax.errors import UserError
-from rsjax.files import read_json
+from rsjax.model_directory import Part, has_weights, read_settings
 from rsjax.models.irasim.config import IRASimConfig, KLConfig
 from rsjax.models.irasim.dit import Architecture, architecture
 from rsjax.models.saved import check_family
@@ -84,12 +84,12 @@ def completed(fresh: Params, saved: Params) -> Params:
     return unflatten_dict(there, sep="/")
 
 
-def _section(directory: Path, name: str, kind: type[C], stage: str, command: str) -> C | Config:
+def _section(directory: Path, name: str, kind: type[C], stage: Part, command: str) -> C | Config:
     cure = f"make it with rsjax convert {command}"
-    if not (directory / stage / "weights").exists():
+    if not has_weights(directory, stage):
         raise UserError(f"{directory}: holds no {stage}/weights with their settings in config.json; {cure}")
     path = directory / "config.json"
-    settings = read_json(path, cure=cure)
+    settings = read_settings(directory, cure)
     check_family(path, settings, (IRASimConfig.family,))
     if not settings.keys() & {name, "model"}:
         raise UserError(f"{path}: describes no network of IRASim but {', '.join(settings) or 'nothing'}; {cure}")

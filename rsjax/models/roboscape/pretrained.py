@@ -14,7 +14,7 @@ from flax.traverse_util import flatten_dict, unflatten_dict
 from rsjax.config import Config, ConfigError, Departures, GenieConfig, RoboScapeConfig, TransformerConfig, from_dict
 from rsjax.config.fields import differences
 from rsjax.errors import UserError
-from rsjax.files import read_json
+from rsjax.model_directory import has_weights, read_settings
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.transformer import Transformer
 from rsjax.models.saved import check_family
@@ -42,7 +42,7 @@ def read_architecture(directory: Path) -> Architecture:
         UserError: the settings are missing, damaged, of another version or of another family.
     """
     path = directory / "config.json"
-    settings = read_json(path, cure="make it with rsjax convert")
+    settings = read_settings(directory, "make it with rsjax convert")
     check_family(path, settings, (RoboScapeConfig.family, GenieConfig.family))
     if not settings.keys() & {"architecture", "model"}:
         raise UserError(f"{directory}: holds no world_model/weights with their settings in config.json")
@@ -61,7 +61,7 @@ def shapes(own: Architecture, directory: Path) -> Params:
     Raises:
         UserError: the weights are missing or of another network; the message names the differing fields.
     """
-    if not (directory / "world_model" / "weights").exists():
+    if not has_weights(directory, "world_model"):
         raise UserError(f"{directory}: holds no world_model/weights with their settings in config.json")
     saved = read_architecture(directory)
     # A trained action encoder needs the same inputs.

@@ -1,4 +1,4 @@
-"""Generates videos from a trained run. ``rsjax generate runs/tiny --clips 0 3 --format gif``"""
+"""Generates videos from a trained run. ``rsjax generate tiny --clips 0 3 --format gif``"""
 
 import sys
 from dataclasses import dataclass, fields
@@ -17,7 +17,7 @@ class Options:
     """Generates the frames that follow a clip's prompt, and writes truth and prediction side by side."""
 
     run: tyro.conf.Positional[Path] = tyro.MISSING
-    """A run directory, made by rsjax train."""
+    """A run directory, made by rsjax train; a saved model; or tiny, the model of the package."""
     data_dir: Path = Path("data")
     """Directory of simulated data sets."""
     store: Path | None = None
@@ -33,7 +33,7 @@ class Options:
     frames: int | None = None
     """Frames per video, possibly more than in training; shorter actions are repeated."""
     out: Path | None = None
-    """Directory of the videos; default RUN/generated."""
+    """Directory of the videos; default RUN/generated, or runs/tiny/generated for the package's model."""
     format: Literal["mp4", "gif"] = "mp4"
     """File format."""
     fps: float = 4.0
@@ -68,12 +68,14 @@ def main() -> None:
     """Writes one video per clip and prints its path."""
     tune_process()
     options = parse_options(sys.argv[1:], "rsjax generate", Options.__doc__ or "", Options())
+    from rsjax.model_directory import locate, output_directory
     from rsjax.tools.pipeline.videos import Request, write_videos
 
     decoding = {field.name: getattr(options, field.name) for field in fields(SampleConfig)}
     sample = {name: value for name, value in decoding.items() if value is not None}
     request = Request(options.split, options.clips, options.actions_from, options.actions, options.frames, sample)
-    out = options.out or options.run / "generated"
+    run = locate(options.run)
+    out = options.out or output_directory(run, "generated")
     how = (options.format, options.fps, options.scale, options.store)
-    for path in write_videos(options.run, options.data_dir, request, out, *how):
+    for path in write_videos(run, options.data_dir, request, out, *how):
         print(path)

@@ -11,11 +11,11 @@ from rsjax.errors import UserError, did_you_mean
 from rsjax.runtime import answer_while_importing
 
 COMMANDS = {  # each is a module of this package with a function main
-    "Start here": ("play", "generate", "train"),
+    "Start here": ("demo", "play", "generate", "train"),
     "Data": ("doctor", "ingest", "inspect", "store", "export"),
     "Evaluate": ("evaluate", "compare", "ablation", "paper", "results"),
     "Policies": ("record", "adapt", "judge", "synthesize", "policy_learning", "policy_evaluation", "improve", "plan"),
-    "Models": ("describe", "compile", "bench", "convert", "replay"),
+    "Models": ("save", "hub", "describe", "compile", "bench", "convert", "replay"),
 }
 
 
@@ -43,7 +43,7 @@ def main() -> None:
 
 def overview() -> str:
     """Returns the list of commands, with the first line of each one's docstring, which no import is needed for."""
-    lines = ["usage: rsjax COMMAND …; each has --help. For example: rsjax play runs/tiny"]
+    lines = ["usage: rsjax COMMAND …; each has --help. For example: rsjax demo"]
     for group, names in COMMANDS.items():
         lines += ["", group]
         for name in names:

@@ -1,4 +1,4 @@
-"""Steers the robot inside generated video, in a browser. ``rsjax play runs/tiny``"""
+"""Steers the robot inside generated video, in a browser. ``rsjax play tiny``"""
 
 import sys
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ class Options:
     """Opens a page in which a person steers the robot and the run's model generates what follows (docs/play.md)."""
 
     run: tyro.conf.Positional[Path] = tyro.MISSING
-    """A run directory, made by rsjax train."""
+    """A run directory, made by rsjax train; a saved model; or tiny, the model of the package."""
     data_dir: Path = Path("data")
     """Directory of simulated data sets."""
     store: Path | None = None
@@ -36,7 +36,7 @@ class Options:
     lanes: int = 1
     """Frames of different sessions generated in one pass; use more on a GPU. The number affects the last bits."""
     out: Path | None = None
-    """Directory of videos and clips that viewers keep; default RUN/play."""
+    """Directory of videos and clips that viewers keep; default RUN/play, or runs/tiny/play for the package's model."""
     browser: bool = True
     """Open the page in a browser, if there is a display."""
 
@@ -46,11 +46,11 @@ def main() -> None:
     """Serves the page until Ctrl-C."""
     tune_process()
     options = parse_options(sys.argv[1:], "rsjax play", Options.__doc__ or "", Options())
+    from rsjax.model_directory import locate, output_directory
     from rsjax.tools.play.serve import ServeSettings, serve
     from rsjax.tools.policies.run_data import RunData
 
-    out = options.out or options.run / "play"
+    run = locate(options.run)
+    out = options.out or output_directory(run, "play")
     how = (options.host, options.port, options.sessions, options.idle_minutes, options.lanes, options.browser)
-    serve(
-        RunData(options.run, options.data_dir, options.store), options.policy, options.split, out, ServeSettings(*how)
-    )
+    serve(RunData(run, options.data_dir, options.store), options.policy, options.split, out, ServeSettings(*how))

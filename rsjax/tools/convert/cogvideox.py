@@ -21,6 +21,7 @@ from rsjax.config import ConfigError
 from rsjax.data.store import open_store
 from rsjax.errors import first_line
 from rsjax.files import read_json, write_file, write_json
+from rsjax.model_directory import Part, load_part
 from rsjax.models.cogvideox import autoencoder
 from rsjax.models.cogvideox.config import CausalVAEConfig, CogVideoXConfig
 from rsjax.models.cogvideox.pretrained import saved_architecture
@@ -28,7 +29,7 @@ from rsjax.models.cogvideox.text import EMPTY, write_texts
 from rsjax.models.cogvideox.transformer import shapes
 from rsjax.models.diffusion.config import NoiseConfig
 from rsjax.models.saved import Inputs, read_model
-from rsjax.tools.convert.directory import Part, save_part, saved_part
+from rsjax.tools.convert.directory import save_part, saved_part
 from rsjax.tools.convert.files import (
     REPLACES,
     SETTINGS,
@@ -55,7 +56,6 @@ from rsjax.tools.convert.table import (
     weight_and_bias,
 )
 from rsjax.trainable import Params
-from rsjax.training.checkpoint import load_weights
 
 CLASSES = {"tokenizer": "AutoencoderKLCogVideoX", "world_model": "CogVideoXTransformer3DModel"}
 FACTOR = 0.7  # scaling factor of 5B-I2V's latents; 2B's is 1.15258426
@@ -402,12 +402,12 @@ def export(source: Path, out: Path, part: Part | None = None) -> list[str]:
     model = read_model(source, CogVideoXConfig, part)
     if part == "tokenizer":
         of = jax.eval_shape(lambda key: autoencoder.init(model.autoencoder, key), jax.random.key(0))
-        params = load_weights(source / part / "weights", of)
+        params = load_part(source, part, of)
         settings = autoencoder_settings(model.autoencoder, params)
         params = {name: params[name] for name in ("encoder", "decoder")}
         entries = autoencoder_table(params)
     else:
-        params = load_weights(source / part / "weights", shapes(saved_architecture(model)))
+        params = load_part(source, part, shapes(saved_architecture(model)))
         settings = transformer_settings(model)
         entries = transformer_table(model)
     tensors = to_tensors(params, entries)

@@ -4,12 +4,13 @@ A directory holds a tokenizer, a world model or both; training can start from it
 """
 
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import TypeVar
 
 import jax
 
 from rsjax.config import ModelConfig, TokenizerConfig, to_dict
 from rsjax.files import disk_guard, read_json, write_json
+from rsjax.model_directory import Part, has_weights, load_part
 from rsjax.models.irasim import autoencoder, dit, pretrained
 from rsjax.models.irasim.config import KLConfig
 from rsjax.models.roboscape.architecture import Architecture
@@ -20,10 +21,9 @@ from rsjax.tokenizers.magvit2 import Tokenizer
 from rsjax.tokenizers.training import read_tokenizer_config
 from rsjax.tools.convert.files import ConvertError
 from rsjax.trainable import Params
-from rsjax.training.checkpoint import load_weights, save_weights
+from rsjax.training.checkpoint import save_weights
 
 M = TypeVar("M", bound=ModelConfig)
-Part = Literal["tokenizer", "world_model"]
 
 SECTIONS: dict[type, tuple[str, str]] = {  # configuration → (section of config.json, directory of the weights)
     TokenizerConfig: ("tokenizer", "tokenizer/weights"),
@@ -99,7 +99,7 @@ def saved_part(directory: Path, kind: type[M], part: Part) -> tuple[M, Inputs] |
     Raises:
         UserError: the settings are damaged, or of another family.
     """
-    if not (directory / part / "weights").exists() or not (directory / "config.json").exists():
+    if not has_weights(directory, part) or not (directory / "config.json").exists():
         return None
     return read_model(directory, kind, part), saved_inputs(directory)
 
@@ -112,7 +112,7 @@ def load_tokenizer(directory: Path) -> tuple[TokenizerConfig, Params]:
     """
     config = read_tokenizer_config(directory)
     shapes = jax.eval_shape(Tokenizer(config).init_params, jax.random.key(0))
-    return config, load_weights(directory / "tokenizer" / "weights", shapes)
+    return config, load_part(directory, "tokenizer", shapes)
 
 
 def load_world_model(directory: Path) -> tuple[Architecture, Params]:
@@ -123,18 +123,18 @@ def load_world_model(directory: Path) -> tuple[Architecture, Params]:
     """
     architecture = read_architecture(directory)
     shapes = jax.eval_shape(Transformer(architecture).init_params, jax.random.key(0))
-    return architecture, load_weights(directory / "world_model" / "weights", shapes)
+    return architecture, load_part(directory, "world_model", shapes)
 
 
 def load_kl_autoencoder(directory: Path) -> tuple[KLConfig, Params]:
     """Reads the autoencoder of a converted directory, or of a run of IRASim. Errors as in :func:`load_world_model`."""
     config = pretrained.saved_autoencoder(directory)
     shapes = jax.eval_shape(lambda key: autoencoder.init(config, key), jax.random.key(0))
-    return config, load_weights(directory / "tokenizer" / "weights", shapes)
+    return config, load_part(directory, "tokenizer", shapes)
 
 
 def load_irasim(directory: Path) -> tuple[dit.Architecture, Params]:
     """Reads the transformer of a converted directory, or of a run of IRASim. Errors as in :func:`load_world_model`."""
     architecture = pretrained.saved_network(directory)
     shapes = jax.eval_shape(dit.DiT(architecture).init_params, jax.random.key(0))
-    return architecture, load_weights(directory / "world_model" / "weights", shapes)
+    return architecture, load_part(directory, "world_model", shapes)

@@ -17,12 +17,13 @@ import jax
 
 from rsjax.config import ConfigError, from_dict, to_dict
 from rsjax.files import parse_json, read_json
+from rsjax.model_directory import Part, load_part
 from rsjax.models.ivideogpt.conditional_vq import ConditionalVQ
 from rsjax.models.ivideogpt.config import ConditionalVQConfig, IVideoGPTConfig
 from rsjax.models.ivideogpt.llama import Architecture, LLaMA
 from rsjax.models.ivideogpt.sequence import Layout
 from rsjax.models.saved import Inputs, read_model, saved_inputs
-from rsjax.tools.convert.directory import Part, save_part, saved_part
+from rsjax.tools.convert.directory import save_part, saved_part
 from rsjax.tools.convert.files import (
     REPLACES,
     SETTINGS,
@@ -47,7 +48,6 @@ from rsjax.tools.convert.table import (
     weight_and_bias,
 )
 from rsjax.trainable import Params
-from rsjax.training.checkpoint import load_weights
 
 HEADS = "num_attention_heads"  # in the settings of a transformer
 METADATA = "rsjax.ivideogpt"  # metadata key under which an exported file keeps settings and inputs
@@ -220,7 +220,7 @@ def export(source: Path, out: Path, part: Part | None = None) -> list[str]:
     else:
         shapes = _llama_shapes(model, inputs.action_dim)
         entries = llama_table(model)
-    tensors = to_tensors(load_weights(source / part / "weights", shapes), entries)
+    tensors = to_tensors(load_part(source, part, shapes), entries)
     write_safetensors(out, tensors, {METADATA: json.dumps({"model": to_dict(model), "inputs": inputs._asdict()})})
     return [f"{out}: {len(tensors)} tensors of iVideoGPT's {part}, under their public names{replaces}"]
 

@@ -19,6 +19,7 @@ from rsjax.data.store import MANIFEST, Store, StoreError, open_store
 from rsjax.data.token_sets import tokenizer_key, tokens_key
 from rsjax.errors import UserError
 from rsjax.files import FileError, holder, lock, read_json, write_json
+from rsjax.model_directory import CLIPS, is_saved
 from rsjax.tools.sim.collect import collection_key
 
 STAGES = ("collect", "tokenizer", "tokens", "world_model", "evaluation", "report")  # and, if asked for, depth_estimator
@@ -59,7 +60,9 @@ class Run:
 
     @property
     def clips(self) -> Path:
-        """The path of the store of clips, which all runs on the same episodes share."""
+        """The path of the store of clips, which all runs on the same episodes share; a saved model has its own."""
+        if is_saved(self.directory):
+            return self.directory / CLIPS
         if self.config.data is not None:
             return Path(self.config.data.store)
         return self.data_directory / f"{self.config.sim.env}-{self._collect_key}"
@@ -71,6 +74,8 @@ class Run:
             StoreError: the store is missing or damaged, or another store is in its place.
         """
         key = self.config.data.key if self.config.data is not None else ""
+        if is_saved(self.directory):
+            key = ""  # a few of the clips have a key of their own
         if key and not (self.clips / MANIFEST).exists():
             raise StoreError(f"{self.clips}: the store is missing; if it was moved, name its new path with --store")
         store = open_store(self.clips)
@@ -158,6 +163,8 @@ class Run:
         Raises:
             RunError: the directory contains a trained stage of another configuration; the message names the fields.
         """
+        if is_saved(self.directory):
+            raise RunError(f"{self.directory}: is a saved model; train in another --run-dir, with --train.start-from")
         for stage in (stage for stage in TRAINED if stage in self.stages):
             aside = self.directory / f"{stage}.old"
             shutil.rmtree(aside, ignore_errors=True)  # left by a command that was killed here

@@ -1,7 +1,6 @@
 """The stages of the pipeline. Each reads the output of the previous one and can be run again."""
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, Literal
 
 from rsjax.config import Config
@@ -12,6 +11,7 @@ from rsjax.data.store import Store
 from rsjax.evaluation.metrics.lpips import advice
 from rsjax.evaluation.results import save_evaluation
 from rsjax.files import disk_guard
+from rsjax.model_directory import Part, load_part, locate
 from rsjax.models.base import Assets, create_autoencoder, create_model
 from rsjax.models.load_run import load_tokenizer
 from rsjax.progress import Progress, duration, note, stage
@@ -26,7 +26,7 @@ from rsjax.tools.pipeline.summary import write_summary
 from rsjax.tools.pipeline.validation import TokenizerValidation, WorldModelValidation
 from rsjax.tools.sim.collect import collect
 from rsjax.trainable import Params
-from rsjax.training.checkpoint import load_weights, save_weights
+from rsjax.training.checkpoint import save_weights
 from rsjax.training.distributed import agree, barrier, is_lead, on_lead
 from rsjax.training.log import find_wandb
 from rsjax.training.loop import fit
@@ -257,7 +257,7 @@ def _depth_range(store: Store) -> str:
     return f"{near_far[0]:g} to {near_far[1]:g} {store.manifest.get('depth_unit') or 'metres'}"
 
 
-def pretrained_start(model: Any, start_from: str, part: str) -> Callable[[Params], Params] | None:
+def pretrained_start(model: Any, start_from: str, part: Part) -> Callable[[Params], Params] | None:
     """Returns a function that makes initial parameters from a directory's weights; None if ``start_from`` is empty.
 
     Args:
@@ -268,10 +268,10 @@ def pretrained_start(model: Any, start_from: str, part: str) -> Callable[[Params
     """
     if not start_from:
         return None
-    directory = Path(start_from)
+    directory = locate(start_from)
     shapes = model.pretrained_shapes(directory)
 
     def start(fresh: Params) -> Params:
-        return model.start(fresh, load_weights(directory / part / "weights", shapes), directory)
+        return model.start(fresh, load_part(directory, part, shapes), directory)
 
     return start

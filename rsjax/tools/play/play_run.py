@@ -5,6 +5,7 @@ import math
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ from rsjax.tools.play.messages import Refused
 from rsjax.tools.policies.policy import Policy
 from rsjax.tools.policies.run_data import RunData
 
-SIMULATED = ("robosuite/Lift", "metaworld/")  # sources of clips whose simulator is available here
+SIMULATORS = {"robosuite/Lift": "robosuite", "metaworld/": "metaworld"}  # source of clips → package that simulates it
 # Scores of the run's evaluation that say how far to trust what the page shows.
 MEASURED = ("contact_false_success", "drive_gripper_error_widths")
 FPS = 5.0  # for runs whose clips have no frame rate
@@ -132,14 +133,14 @@ class PlayRun:
 
     @cached_property
     def simulator(self) -> SimConfig | None:
-        """The simulator that the clips are from; None for recordings."""
-        if self.store:
-            source = str(self.store.manifest.get("source") or "")
-        else:
-            source = ""
-        if self.store is None or not source.startswith(SIMULATED):
+        """The simulator that the clips are from; None for recordings, or if its package is not installed."""
+        if self.store is None:
             return None
-        return from_dict(SimConfig, self.store.manifest["config"])
+        source = str(self.store.manifest.get("source") or "")
+        for beginning, package in SIMULATORS.items():
+            if source.startswith(beginning) and find_spec(package) is not None:
+                return from_dict(SimConfig, self.store.manifest["config"])
+        return None
 
     @cached_property
     def measured(self) -> dict[str, float]:

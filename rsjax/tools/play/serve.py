@@ -73,7 +73,7 @@ def serve(data: RunData, policy: Path | None, split: str, out: Path, settings: S
     hub = Hub(run, engine, settings.sessions, 60 * settings.idle_minutes)
     address = _address(listener, settings.host, guard)
     print(f"{address}  (Ctrl-C ends it)", flush=True)
-    if settings.browser and _has_display():
+    if settings.browser and has_display():
         threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()
     config = uvicorn.Config(
         make_app(hub, guard),
@@ -140,6 +140,6 @@ def _address(listener: socket.socket, host: str, guard: Guard) -> str:
     return f"http://{name}:{listener.getsockname()[1]}/{token}"
 
 
-def _has_display() -> bool:
+def has_display() -> bool:
     """Returns whether a browser can open outside this terminal."""
     return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

@@ -11,6 +11,7 @@ from rsjax.data.clips import readable
 from rsjax.data.store import Store, open_store
 from rsjax.errors import UserError
 from rsjax.evaluation.coverage import make_coverage
+from rsjax.model_directory import has_weights
 from rsjax.models.load_run import load, load_config
 from rsjax.models.trained import TrainedModel
 from rsjax.tools.pipeline.provenance import training_settings
@@ -112,7 +113,7 @@ class RunData:
                 f"{self.run}: frames of {shapes[0][0]} pixels and actions of {shapes[0][1]} numbers, {like.run} has "
                 f"{shapes[1][0]} and {shapes[1][1]}; compare runs on the same clips"
             )
-        if not (self.run / "world_model" / "weights").exists():
+        if not has_weights(self.run, "world_model"):
             raise UserError(f"{self.run}: its world model is not trained yet; the train command of this run goes on")
 
     def judge(self, folder: Path | None = None) -> Judge:

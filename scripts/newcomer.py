@@ -1,0 +1,121 @@
+"""What a newcomer does with the installed package, outside any checkout; ``scripts/wheel.sh`` calls it.
+
+Each step is a function, and prints how long it took. It uses nothing but the package and what came with it.
+"""
+
+import json
+import subprocess
+import sys
+import time
+import urllib.request
+from collections.abc import Callable
+from pathlib import Path
+
+STEPS: list[Callable[[], None]] = []
+
+
+def step(function: Callable[[], None]) -> Callable[[], None]:
+    """Adds a step."""
+    STEPS.append(function)
+    return function
+
+
+def rsjax(*words: str) -> str:
+    """Runs the command, which must succeed, and returns what it prints."""
+    done = subprocess.run(["rsjax", *words], capture_output=True, text=True)
+    if done.returncode:
+        raise SystemExit(f"rsjax {' '.join(words)} ended with {done.returncode}:\n{done.stdout}{done.stderr}")
+    return done.stdout
+
+
+@step
+def commands_are_listed() -> None:
+    assert "rsjax demo" in rsjax("--help")
+    assert "usage" in rsjax("train", "tiny", "--help")
+
+
+@step
+def the_package_is_the_installed_one_alone() -> None:
+    import rsjax as package
+
+    folder = Path(package.__file__).parent
+    assert folder.parent.name == "site-packages", folder
+    assert (folder / "py.typed").exists()
+    for name in ("experiments", "tests", "scripts", "benchmarks"):
+        assert not (folder.parent / name).exists(), f"the wheel holds {name}"
+    for name in ("mujoco", "robosuite", "torch"):
+        assert not (folder.parent / name).exists(), f"{name} came with the wheel"
+
+
+@step
+def demo_writes_a_video_and_a_picture() -> None:
+    *files, _ = rsjax("demo", "--video").splitlines()
+    assert [Path(file).suffix for file in files] == [".mp4", ".png"], files
+    assert all(Path(file).stat().st_size > 10_000 for file in files)
+
+
+@step
+def three_lines_of_python_generate() -> None:
+    import rsjax as package
+
+    model = package.load("tiny")
+    clip = package.examples("tiny")[0]
+    video = model.generate(clip["rgb"][:1], clip["actions"])
+    assert video.rgb.shape == clip["rgb"].shape
+
+
+@step
+def generate_writes_videos() -> None:
+    written = rsjax("generate", "tiny", "--clips", "0", "1", "--actions-from", "2", "--format", "gif").splitlines()
+    assert [Path(file).exists() for file in written] == [True, True], written
+    assert Path(written[0]).parent == Path("runs/tiny/generated")
+
+
+@step
+def play_serves_the_page_and_a_frame_is_driven() -> None:
+    from websockets.sync.client import connect
+
+    line = ["rsjax", "play", "tiny", "--port", "0", "--no-browser"]
+    with subprocess.Popen(line, stdout=subprocess.PIPE, text=True) as server:
+        try:
+            assert server.stdout is not None
+            address = server.stdout.readline().split()[0]
+            with urllib.request.urlopen(address) as page:
+                assert b"<html" in page.read()
+            with connect(address.replace("http", "ws", 1) + "ws", max_size=2**24) as socket:
+                sources = json.loads(socket.recv())["sources"]
+                assert sources["clip"] == "", sources
+                socket.send(json.dumps({"type": "start", "id": 1, "clip": 0}))
+                answer(socket, 1, "session")
+                socket.send(json.dumps({"type": "step", "id": 2, "branch": 0, "source": {"kind": "random"}}))
+                assert answer(socket, 2, "stepped")["frame"] == 1
+        finally:
+            server.terminate()
+
+
+def answer(socket: object, number: int, kind: str) -> dict:
+    """Returns the final answer to a message, which must be of this type; pictures come before it."""
+    pictures = 0
+    while True:
+        message = socket.recv(timeout=60)  # type: ignore[attr-defined]
+        if isinstance(message, bytes):
+            pictures += 1
+            continue
+        content = json.loads(message)
+        if content.get("id") == number and content["type"] in (kind, "error"):
+            assert content["type"] == kind and pictures, content
+            return content
+
+
+def main() -> None:
+    """Runs the steps whose names contain one of the arguments; without arguments, all."""
+    for function in STEPS:
+        if sys.argv[1:] and not any(word in function.__name__ for word in sys.argv[1:]):
+            continue
+        began = time.monotonic()
+        function()
+        print(f"{function.__name__.replace('_', ' ')}: {time.monotonic() - began:.1f} s", flush=True)
+
+
+if __name__ == "__main__":
+    main()

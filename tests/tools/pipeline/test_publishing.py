@@ -1,0 +1,130 @@
+"""Tests saving a finished run to publish, and what the commands do with the directory it makes."""
+
+import json
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from PIL import Image
+
+import rsjax
+from rsjax.data.clips import load_clips
+from rsjax.errors import UserError
+from rsjax.model_directory import PRETRAINED
+from rsjax.models.load_run import load_config
+from rsjax.tools.pipeline.demo import write_demo
+from rsjax.tools.pipeline.provenance import record_start
+from rsjax.tools.pipeline.publishing import Publication, loss_of_rounding, predicted_psnr, publish
+from rsjax.tools.pipeline.run import Run
+from rsjax.tools.pipeline.videos import Request, write_videos
+from rsjax.tools.play.play_run import PlayRun
+from rsjax.tools.policies.run_data import RunData
+from rsjax.training.checkpoint import save_weights
+from tests.tools.pipeline import toy
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """A finished run on the toy clips, with random weights and made-up scores."""
+    place = tmp_path_factory.mktemp("publishing")
+    run = Run(toy.config(), place / "run", place / "data")
+    trained = toy.trained(toy.store(run.clips))
+    run.prepare(overwrite=False)
+    toy.save_tokenizer(run)
+    run.output("world_model").parent.mkdir(parents=True)
+    save_weights(run.output("world_model"), trained.params)
+    (run.directory / "tokens").mkdir()
+    trained.assets.normalization.save(run.directory / "tokens")
+    record_start(run, "rsjax train toy --run-dir run")
+    scores = {"psnr": 23.256, "psnr_repeat_first": 16.0, "psnr_tokenizer": 25.7, "delta_psnr": 7.3, "ssim": None}
+    (run.directory / "metrics.json").write_text(json.dumps(scores))
+    return run
+
+
+@pytest.fixture(scope="module")
+def published(run: Run, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("published") / "toy"
+    lost = publish(run, out, Publication(clips=2, measured=3, license="apache-2.0", note="For tests."))
+    assert lost in (out / "README.md").read_text()
+    return out
+
+
+def test_a_published_run_is_a_model_with_clips(run: Run, published: Path) -> None:
+    loaded = rsjax.load(published)
+    assert loaded.config == run.config
+    clips = Run(loaded.config, published, Path("nowhere")).open_clips()
+    assert clips.counts() == {"test": 2}
+    originals = run.open_clips().source("test")
+    for number, record in zip(clips.manifest["excerpt"]["records"], clips.source("test"), strict=False):
+        np.testing.assert_array_equal(record["rgb"], originals[number]["rgb"])
+        np.testing.assert_array_equal(record["actions"], originals[number]["actions"])
+
+
+def test_the_card_is_made_of_the_runs_records(published: Path) -> None:
+    card = (published / "README.md").read_text()
+    for words in (
+        "license: apache-2.0",
+        "For tests.",
+        "3 training clips and 5 held-out ones",
+        "Key of the store: `toy`. In `clips/`: held-out clips 0, 4.",
+        "`rsjax train toy --run-dir run`, preset `debug`",
+        "| prediction | 23.26 | 7.30 |",
+        "| first frame repeated | 16.00 |",
+        "## Limits and misuse",
+    ):
+        assert words in card, words
+    assert "SSIM" not in card  # has no score
+
+
+def test_the_loss_of_rounding_is_the_difference_of_two_means(run: Run, published: Path) -> None:
+    exact = rsjax.load(run.directory)
+    rounded = rsjax.load(published)
+    clips = load_clips(run.open_clips(), 5)
+    means = [predicted_psnr(model, clips).mean() for model in (exact, rounded)]
+    assert f"a loss of {means[0] - means[1]:.3f} dB" in loss_of_rounding(exact, rounded, clips, "float16")
+    assert "a loss of 0.000 dB" in loss_of_rounding(exact, exact, clips, "float32")
+
+
+def test_videos_the_demo_and_the_playground_work_from_the_directory_alone(published: Path, tmp_path: Path) -> None:
+    request = Request("test", (1,), None, None, None, {})
+    (written,) = write_videos(published, Path("nowhere"), request, tmp_path, "mp4", 4.0, 1)
+    assert written.name == "test_001.mp4"
+    video, strip = write_demo(published, Path("nowhere"), tmp_path / "demo", 1)
+    with av.open(str(video)) as container:
+        assert len(list(container.decode(video=0))) == toy.config().sim.frames
+    with Image.open(strip) as picture:
+        assert min(picture.size) > 100
+    with pytest.raises(UserError, match=r"--clip 2: the model has clips 0 … 1"):
+        write_demo(published, Path("nowhere"), tmp_path / "demo", 2)
+    play = PlayRun(RunData(published, Path("nowhere")))
+    assert (play.clips, play.missing, play.describe()["name"]) == (2, "", "toy")
+    assert play.controls.width == toy.config().clips.action_dim
+
+
+def test_an_unfinished_run_is_refused(run: Run, tmp_path: Path) -> None:
+    with pytest.raises(UserError) as caught:
+        publish(Run(run.config, tmp_path, tmp_path), tmp_path / "out", Publication())
+    assert "metrics.json: missing; the train command of this run makes it" in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["tiny"])
+def test_the_package_holds_a_small_model_that_beats_repeating_the_first_frame(name: str) -> None:
+    folder = PRETRAINED / name
+    assert (folder / "model.safetensors").stat().st_size <= 10e6
+    assert sum(path.stat().st_size for path in (folder / "clips").iterdir()) <= 3e6
+    assert load_config(folder).name == name
+    clips = load_clips(Run(load_config(folder), folder, Path()).open_clips(), 2)
+    still = 10 * np.log10(255**2 / ((clips.rgb[:, 1:] - clips.rgb[:, :1].astype(float)) ** 2).mean((2, 3, 4)))
+    assert predicted_psnr(rsjax.load(name), clips).mean() > still.mean() + 2
+
+
+def test_a_model_that_is_not_in_the_package_is_made_by_a_command_that_the_error_names(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    if (PRETRAINED / "multitask").exists():
+        pytest.skip("it is there")
+    with pytest.raises(UserError) as caught:
+        rsjax.load("multitask")
+    assert "rsjax train multitask, then rsjax save runs/multitask multitask" in str(caught.value)
