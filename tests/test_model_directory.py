@@ -67,8 +67,9 @@ def test_half_precision_rounds_each_parameter_once_and_halves_the_file(model: Tr
 
 def test_a_value_that_half_precision_cannot_hold_is_refused(model: TrainedModel, tmp_path: Path) -> None:
     large = replace(model, params=jax.tree.map(lambda x: x * 0 + 1e5, model.params))
-    with pytest.raises(UserError, match=r"^world_model/.* has values that float16 cannot hold; save it as float32"):
+    with pytest.raises(UserError) as caught:
         large.save(tmp_path / "large", "float16")
+    assert "has values that float16 cannot hold; save it as float32" in str(caught.value)
 
 
 def flip_a_bit(path: Path) -> None:

@@ -32,14 +32,7 @@ from rsjax.layers.unstacked_params import apart, together
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.departures import guidance, mean_codes, state_heads
 from rsjax.models.roboscape.maskgit import Frame, unmask_step
-from rsjax.models.roboscape.transformer import (
-    Cache,
-    Cells,
-    StackedCache,
-    empty_cache,
-    run_transformer,
-    run_with_trunk,
-)
+from rsjax.models.roboscape.transformer import Cache, Cells, StackedCache, empty_cache, run_transformer, run_with_trunk
 from rsjax.trainable import Params
 
 ADDED_IN_BF16 = ("proj", "depth_to_rgb")  # layers that add their bias to features; the MLP's kernel adds it in float32

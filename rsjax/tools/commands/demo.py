@@ -49,7 +49,7 @@ def main() -> None:
         )
         return
     from rsjax.progress import note
-    from rsjax.tools.pipeline.demo import write_demo
+    from rsjax.tools.pipeline.videos import write_demo
 
     note("generating a clip from its first frame, under its own actions and under another clip's …")
     for path in write_demo(model, options.data_dir, options.out, options.clip):

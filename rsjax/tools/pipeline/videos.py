@@ -1,6 +1,7 @@
-"""Generates videos with the model of a trained run, one per clip."""
+"""Generates videos with the model of a trained run, one per clip, and a demonstration of it."""
 
 import dataclasses
+import io
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,24 +9,26 @@ from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float, UInt8
+from PIL import Image
 
 from rsjax.clip import Video
 from rsjax.config import Config
 from rsjax.data.clips import Clips
 from rsjax.data.store import Record, Source
 from rsjax.errors import UserError
-from rsjax.files import placeholder, regular
+from rsjax.files import placeholder, regular, write_file
 from rsjax.models.base import create_model
 from rsjax.models.load_run import load
 from rsjax.models.trained import TrainedModel
 from rsjax.tools.pipeline.limits import check_rollout
 from rsjax.tools.pipeline.run import Run
 from rsjax.tools.pipeline.run_clips import relocated
-from rsjax.tools.studies.report.figures import ClipFigure, animation
+from rsjax.tools.studies.report.figures import ClipFigure, animation, filmstrip
 from rsjax.tools.studies.report.video import write_gif, write_mp4
 
 FPS = (0.1, 240.0)  # a GIF cannot show a frame for more than eleven minutes
 MOST_SCALE = 64
+DEMO_FPS = 4.0
 
 
 @dataclass(frozen=True)
@@ -96,6 +99,37 @@ def write_videos(
         frames = made.rgb[0] if alone else _side_by_side(clip, made, number)
         (write_mp4 if kind == "mp4" else write_gif)(path, frames, fps, scale if alone else 1)
         yield path
+
+
+def write_demo(model: Path, data_dir: Path, out: Path, number: int) -> list[Path]:
+    """Generates a held-out clip from its first frame, under its own actions and under the next clip's.
+
+    Returns:
+        The paths of a video and of a film strip. Their rows: the recording, the two predictions, and depth.
+
+    Raises:
+        UserError: the model or its clips are missing, or it has no clip of this number.
+    """
+    trained = load(model)
+    source = Run(trained.config, model, data_dir).open_clips().source("test")
+    if not 0 <= number < len(source):
+        raise UserError(f"--clip {number}: the model has clips 0 … {len(source) - 1}")
+    clip = source[number]
+    prompt = Clips.stacked([clip], [number]).video.frames(0, trained.config.prompt_frames)
+    other = source[(number + 1) % len(source)]["actions"]
+    videos = trained.model.plan(trained.params, trained.assets, prompt, np.stack([clip["actions"], other]))
+    depth = {}
+    if videos.depth is not None:
+        depth = {"true_depth": clip["depth"], "predicted_depth": videos.depth[0]}
+    title = f"clip {number}: {clip['task']}"
+    figure = ClipFigure(title, clip["rgb"], videos.rgb[0], other_actions=videos.rgb[1], **depth)
+    video = out / f"clip-{number}.mp4"
+    strip = video.with_suffix(".png")
+    write_mp4(video, animation(figure), DEMO_FPS)
+    picture = io.BytesIO()
+    Image.fromarray(filmstrip(figure)).save(picture, "PNG")
+    write_file(strip, picture.getvalue())
+    return [video, strip]
 
 
 def chosen_clips(request: Request, source: Source) -> tuple[int, ...]:

@@ -19,15 +19,7 @@ from rsjax.clip import words_of
 from rsjax.errors import did_you_mean
 from rsjax.files import safe_id
 from rsjax.tools.ingest.actions import Layout, align_actions, continuous_signs
-from rsjax.tools.ingest.episode import (
-    LEAVE_OUT,
-    Episode,
-    EpisodeError,
-    EpisodeRef,
-    SourceError,
-    checked,
-    fingerprint,
-)
+from rsjax.tools.ingest.episode import LEAVE_OUT, Episode, EpisodeError, EpisodeRef, SourceError, checked, fingerprint
 from rsjax.tools.ingest.formats.files import broken, inside, location_of
 from rsjax.tools.ingest.formats.hdf5 import (
     H5Frames,

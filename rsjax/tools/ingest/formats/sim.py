@@ -16,15 +16,7 @@ from rsjax.clip import UNKNOWN, words_of
 from rsjax.data.store import Record, Store, StoreError, open_store
 from rsjax.errors import did_you_mean
 from rsjax.tools.ingest.actions import Kind, Layout, layout_of
-from rsjax.tools.ingest.episode import (
-    LEAVE_OUT,
-    Episode,
-    EpisodeError,
-    EpisodeRef,
-    SourceError,
-    checked,
-    fingerprint,
-)
+from rsjax.tools.ingest.episode import LEAVE_OUT, Episode, EpisodeError, EpisodeRef, SourceError, checked, fingerprint
 from rsjax.tools.ingest.pictures import ArrayFrames
 
 FPS = 5.0  # assumed for a clip that does not say how it was made

@@ -26,14 +26,7 @@ from rsjax.tools.pipeline import stages
 from rsjax.tools.pipeline.run import Run, link
 from rsjax.tools.studies.ablation.figure import draw
 from rsjax.tools.studies.ablation.grid import FILE, Choice, Grid, add_cells, merge, read_grid, repeated_cells
-from rsjax.tools.studies.ablation.table import (
-    Row,
-    as_csv,
-    as_json,
-    as_markdown,
-    shown_columns,
-    tabulate,
-)
+from rsjax.tools.studies.ablation.table import Row, as_csv, as_json, as_markdown, shown_columns, tabulate
 from rsjax.tools.studies.results import ERROR, State, read_metrics, read_run
 
 SHARED = ("tokenizer", "tokens", "world_model")  # each stage needs the stages before it

@@ -18,13 +18,7 @@ from rsjax.progress import duration
 from rsjax.tools.studies.report.curves import curves_svg
 from rsjax.tools.studies.report.figures import ClipFigure, filmstrip, keypoints
 from rsjax.tools.studies.report.player import player_clip, player_script, player_style
-from rsjax.tools.studies.report.score_charts import (
-    PLACE_SCENES,
-    SCENES,
-    frame_curves_svg,
-    place_errors_svg,
-    probes_svg,
-)
+from rsjax.tools.studies.report.score_charts import PLACE_SCENES, SCENES, frame_curves_svg, place_errors_svg, probes_svg
 from rsjax.tools.studies.report.targets import judge
 from rsjax.tools.studies.report.video import webp_uri
 from rsjax.tools.studies.tables import CellText, Footnotes, Marked, Table, as_html
