@@ -134,7 +134,7 @@ class TrainedModel:
         if self.config.data is not None:  # the name of the store is enough; its path is this machine's
             settings["data"]["store"] = Path(self.config.data.store).name
         parts: dict[Part, Params] = {"world_model": self.params}
-        if self.config.model.uses_tokenizer:
+        if self.config.model.uses_tokenizer and self.assets.tokenizer is not None:
             parts["tokenizer"] = self.assets.tokenizer
         saved = {"normalization": asdict(self.assets.normalization)}
         save_directory(directory, settings, saved, parts, dtype, card or model_card(self.config, directory.name))
