@@ -5,7 +5,7 @@ from rsjax.config import Config
 LIMITS = """\
 - It knows the robot, the camera, the objects and the kinds of motion that it was trained on. Other pictures give frames
   that look like the training data, whatever is in them; nothing warns of that.
-- Errors add up from frame to frame. Where it is unsure it shows a blur, or the cube follows a gripper that does not
+- Errors add up from frame to frame. Where it is unsure it shows a blur, or an object follows a gripper that does not
   hold it: do not read success in a generated video as success on a robot without a check in the real world.
 - Actions far from those of the training data lead to frames that mean nothing.
 
