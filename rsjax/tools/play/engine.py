@@ -41,6 +41,10 @@ class Work:
         return self.has_depth, self.decoding.program
 
 
+class EngineClosedError(RuntimeError):
+    """A frame was requested from an engine that was closed, because its server ends."""
+
+
 class Engine:
     """Generates frames, in the order of the requests.
 
@@ -82,13 +86,23 @@ class Engine:
         return self.branching(first.depth is not None).begin(first)
 
     def submit(self, work: Work) -> "Future[BranchState]":
-        """Requests a frame."""
+        """Requests a frame.
+
+        Raises:
+            EngineClosedError: the server ends.
+        """
         with self._wake:
             if self._closed:
-                raise RuntimeError("the engine is closed")
+                raise EngineClosedError("the engine is closed")
             self._waiting.append(work)
             self._wake.notify()
         return work.done
+
+    @property
+    def waiting(self) -> int:
+        """The number of frames whose pass has not begun."""
+        with self._wake:
+            return len(self._waiting)
 
     def close(self) -> None:
         """Ends the thread and cancels waiting frames."""

@@ -69,7 +69,7 @@ def serve(data: RunData, policy: Path | None, split: str, out: Path, settings: S
     guard = Guard("" if is_loopback(settings.host) else secrets.token_urlsafe(16))
     if run.missing:
         note(f"no clips to begin with ({run.missing}); only uploaded pictures")
-    _prepare(run, engine)
+    prepare(run, engine)
     hub = Hub(run, engine, settings.sessions, 60 * settings.idle_minutes)
     address = _address(listener, settings.host, guard)
     print(f"{address}  (Ctrl-C ends it)", flush=True)
@@ -107,8 +107,8 @@ def listen(host: str, port: int) -> socket.socket:
         ) from error
 
 
-def _prepare(run: PlayRun, engine: Engine) -> None:
-    """Compiles the programs for the first frame, so that nobody waits for them later."""
+def prepare(run: PlayRun, engine: Engine) -> None:
+    """Compiles the programs for the first frame, so that nobody waits for them later, and prints a frame's time."""
     note("compiling (seconds, or minutes for a large model the first time) …")
     first = Video(_grey(run))
     size = run.controls.width

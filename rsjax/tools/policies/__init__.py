@@ -7,6 +7,7 @@ Importing this package registers the environments with Gymnasium::
     gymnasium.make("rsjax/WorldModel-v0", run="runs/tiny")
     gymnasium.make_vec("rsjax/WorldModel-v0", num_envs=64, run="runs/tiny")
     gymnasium.make("rsjax/Lift-v0")
+    gymnasium.make("rsjax/RemoteWorldModel-v0", url="ws://127.0.0.1:8643")  # served by experiments.serve
 """
 
 from typing import TYPE_CHECKING, Any
@@ -23,6 +24,7 @@ _ENVIRONMENTS: dict[str, dict[str, Any]] = {
         "vector_entry_point": f"{_MODULE}:WorldModelVectorEnv",
     },
     "rsjax/Lift-v0": {"entry_point": f"{_MODULE}:LiftEnv"},
+    "rsjax/RemoteWorldModel-v0": {"entry_point": "rsjax.tools.serve.client:RemoteWorldModelEnv"},
 }
 
 

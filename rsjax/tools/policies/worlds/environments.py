@@ -17,6 +17,7 @@ from jaxtyping import UInt8
 from rsjax.config import SimConfig
 from rsjax.data.state_labels import STATE
 from rsjax.errors import UserError
+from rsjax.models.base import Imagination
 from rsjax.models.load_run import load
 from rsjax.models.trained import TrainedModel
 from rsjax.tools.policies.judges.head_judge import NAME as HEAD
@@ -66,7 +67,13 @@ class EnvironmentSettings:
 class _Model:
     """What both environments of a world model need: its world, first frames and spaces."""
 
-    def __init__(self, run: Path | str | TrainedModel, count: int, settings: EnvironmentSettings) -> None:
+    def __init__(
+        self,
+        run: Path | str | TrainedModel,
+        count: int,
+        settings: EnvironmentSettings,
+        imagination: Imagination | None = None,
+    ) -> None:
         if isinstance(run, TrainedModel):
             trained = run
             folder = Path(".")
@@ -89,7 +96,7 @@ class _Model:
             judge = head_judge(trained, folder)
         else:
             judge = judge_of(run, settings.judge, size)
-        self.world = ModelWorld(trained, count, judge, whole_videos=False)
+        self.world = ModelWorld(trained, count, judge, whole_videos=False, imagination=imagination)
         self.starts = Starts(config, folder, Path(settings.data_dir), store, settings.split, has_depth)
         self.action_space = spaces.Box(self.world.actions.low, self.world.actions.high)
         observation: dict[str, spaces.Space[Any]] = {"rgb": spaces.Box(0, 255, (size, size, 3), np.uint8)}
@@ -130,6 +137,7 @@ class WorldModelEnv(gymnasium.Env[Any, Any]):
     Args:
         run: a run directory of rsjax train, or a model that ``rsjax.load`` loaded.
         render_mode: "rgb_array", or None.
+        imagination: generates the frames; by default the model itself, in this process.
         settings: fields of :class:`EnvironmentSettings`.
 
     Raises:
@@ -139,9 +147,15 @@ class WorldModelEnv(gymnasium.Env[Any, Any]):
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 5}  # noqa: RUF012 - Gymnasium's own type
 
-    def __init__(self, run: Path | str | TrainedModel, render_mode: str | None = None, **settings: Any) -> None:
+    def __init__(
+        self,
+        run: Path | str | TrainedModel,
+        render_mode: str | None = None,
+        imagination: Imagination | None = None,
+        **settings: Any,
+    ) -> None:
         self._settings = EnvironmentSettings(**settings)
-        model = _Model(run, 1, self._settings)
+        model = _Model(run, 1, self._settings, imagination)
         self._world = model.world
         self._starts = model.starts
         self._frame: np.ndarray | None = None

@@ -53,6 +53,7 @@ class ModelWorld:
         actions: the actions that it takes; by default those of its run.
         whole_videos: whether a family that generates only whole videos may serve, one short video for each frame.
         coverage: the bank of training clips from which the distance of episodes is measured; None: it is not.
+        imagination: generates the frames of ``count`` clips; by default the model itself.
 
     Raises:
         UserError: the family cannot generate frame by frame, and ``whole_videos`` is False.
@@ -66,6 +67,7 @@ class ModelWorld:
         actions: ActionRange | None = None,
         whole_videos: bool = True,
         coverage: Coverage | None = None,
+        imagination: Imagination | None = None,
     ) -> None:
         self.count = count
         self.actions = actions or action_range(trained.config, trained.assets.normalization)
@@ -75,7 +77,9 @@ class ModelWorld:
         self._history = frames_of(judge)
         self._coverage = coverage
         self._imagination: Imagination
-        if whole_videos and type(trained.model).imagine is WorldModel.imagine:
+        if imagination is not None:
+            self._imagination = imagination
+        elif whole_videos and type(trained.model).imagine is WorldModel.imagine:
             self._imagination = WholeVideoImagination(trained)
         else:
             self._imagination = trained.model.imagine(trained.params, trained.assets, count)

@@ -1,0 +1,248 @@
+"""The server of a world model: connections, the token, limits, and what it says of itself."""
+
+import hmac
+import http
+import threading
+import time
+import traceback
+from concurrent.futures import CancelledError
+from contextlib import suppress
+from dataclasses import dataclass
+from socket import socket as Socket
+from typing import Any
+
+from websockets.exceptions import ConnectionClosed
+from websockets.frames import CloseCode
+from websockets.http11 import Request, Response
+from websockets.sync.server import Server, ServerConnection, serve
+
+import rsjax
+from rsjax.config.fields import require, require_range
+from rsjax.devices import on_cpu
+from rsjax.errors import UserError, first_line
+from rsjax.progress import note
+from rsjax.tools.play.engine import Engine, EngineClosedError
+from rsjax.tools.play.guard import is_loopback
+from rsjax.tools.play.play_run import PlayRun
+from rsjax.tools.play.serve import listen, prepare
+from rsjax.tools.play.session import first_settings
+from rsjax.tools.policies.judges.judge import Judge
+from rsjax.tools.policies.judges.judge_training import judge_of
+from rsjax.tools.policies.worlds.environments import WorldModelEnv
+from rsjax.tools.serve.session import Session
+from rsjax.tools.serve.shared_steps import SharedSteps
+from rsjax.tools.serve.wire import WireError, pack, unpack
+
+VERSION = 1  # of the messages
+STRIKES = 20  # messages in a row that cannot be answered, after which a client is disconnected
+VIDEO_BYTES = 64 * 2**20  # of a generated video; for large pictures this lowers the number of frames
+SPARE_BYTES = 64 * 2**10  # of a message beside its arrays
+LEAST_TOKEN = 16  # characters
+ACCELERATOR_LANES = 8
+
+
+@dataclass(frozen=True)
+class WorldServerSettings:
+    """The settings of the server.
+
+    Attributes:
+        host: the address to listen at.
+        port: the port; 0: a free one.
+        token: a secret that clients must send; "" for none, which only the loopback address allows.
+        clients: connections at a time.
+        lanes: steps of different clients that one pass generates; 0: 8 on an accelerator, 1 on a CPU.
+        frames: frames of an episode, or of a generated video, at most.
+        idle_minutes: minutes without a message after which a client is disconnected.
+    """
+
+    host: str = "127.0.0.1"
+    port: int = 8643
+    token: str = ""
+    clients: int = 16
+    lanes: int = 0
+    frames: int = 256
+    idle_minutes: float = 30.0
+
+    def __post_init__(self) -> None:
+        require_range(self, "serve", 1, 256, "clients")
+        require_range(self, "serve", 0, 256, "lanes")
+        require(2 <= self.frames <= 4096, f"--frames is {self.frames}; it is from 2 to 4096")
+        require(0 <= self.port < 2**16, f"--port is {self.port}; it is from 0 to 65535")
+        require(0 < self.idle_minutes <= 1440, f"--idle-minutes is {self.idle_minutes}; it is above 0, to 1440")
+        require(
+            bool(self.token) or is_loopback(self.host),
+            f"--host {self.host} lets other machines in, which takes a secret: "
+            f"export RSJAX_TOKEN=$(openssl rand -hex 16)",
+        )
+        require(
+            not self.token or len(self.token) >= LEAST_TOKEN,
+            f"the token has {len(self.token)} characters; take at least {LEAST_TOKEN} (openssl rand -hex 16)",
+        )
+
+
+class WorldServer:
+    """Serves a run to clients, each in a thread of its own; one engine generates the frames of all.
+
+    Args:
+        run: the run and its clips.
+        settings: address and limits.
+        judge: decides on success; "run": the run's own judge, if it has one.
+
+    Attributes:
+        engine: generates the frames of all clients.
+        metadata: the first message to each client.
+
+    Raises:
+        UserError: the run is missing or unfinished, or its model takes no actions or cannot generate frame by frame.
+    """
+
+    def __init__(self, run: PlayRun, settings: WorldServerSettings, judge: Judge | str = "run") -> None:
+        trained = run.trained
+        size = trained.config.clips.image_size
+        self._run = run
+        self._settings = settings
+        self._judge = judge_of(run.data.run, judge, size)
+        self.engine = Engine(trained, settings.lanes or _usual_lanes())
+        decoding = first_settings(trained.config).decoding(trained.config.model.sample.seed, 0)  # type: ignore[attr-defined]
+        self._decoding = decoding
+        self._places = threading.Semaphore(settings.clients)
+        self._frames = max(2, min(settings.frames, VIDEO_BYTES // (size * size * 7)))  # 3 bytes of RGB, 4 of depth
+        self.metadata = self._describe()
+
+    def environment(self) -> WorldModelEnv:
+        """Returns an environment whose steps the engine makes, for one client."""
+        data = self._run.data
+        return WorldModelEnv(
+            self._run.trained,
+            imagination=SharedSteps(self.engine, self._decoding),
+            data_dir=data.data_dir,
+            store=data.moved,
+            split=self._run.split,
+            max_steps=self._frames - 1,
+            judge=self._judge,
+        )
+
+    def open(self, listener: Socket) -> Server:
+        """Returns a server on a listening socket; its ``serve_forever`` accepts clients."""
+        config = self._run.trained.config.clips
+        frame = config.image_size**2 * (3 + 8)  # its depth may come as float64
+        actions = self._frames * config.action_dim * 8
+        return serve(
+            self._serve_client,
+            sock=listener,
+            origins=[None],  # no browser: a page of another site cannot reach the server through one
+            process_request=self._refusal,
+            compression=None,
+            max_size=frame + actions + SPARE_BYTES,
+            server_header=None,
+        )
+
+    def close(self) -> None:
+        """Ends the engine, so that no client waits for a frame any more."""
+        self.engine.close()
+
+    def _describe(self) -> dict[str, Any]:
+        env = self.environment()
+        space: Any = env.action_space
+        observation: Any = env.observation_space
+        facts = {
+            "server": "rsjax",
+            "version": VERSION,
+            "rsjax": rsjax.__version__,
+            "synthetic": "every frame is generated by a world model; none shows a real event",
+            "judge": self._judge is not None,
+            "action_low": space.low,
+            "action_high": space.high,
+            "limits": {
+                "frames": self._frames,
+                "clients": self._settings.clients,
+                "idle_seconds": 60 * self._settings.idle_minutes,
+            },
+        }
+        if "depth" in observation.spaces:
+            facts["depth_high"] = float(observation["depth"].high.max())
+        return self._run.describe() | facts
+
+    def _refusal(self, connection: ServerConnection, request: Request) -> Response | None:
+        """Answers a request for health, and refuses a client without the token; None: the client may connect."""
+        if request.path == "/healthz":
+            return connection.respond(http.HTTPStatus.OK, "OK\n")
+        if self._settings.token and not self._knows(request.headers.get("Authorization", "")):
+            return connection.respond(
+                http.HTTPStatus.UNAUTHORIZED, "this server wants its token in Authorization: Api-Key TOKEN\n"
+            )
+        return None
+
+    def _knows(self, authorization: str) -> bool:
+        scheme, _, token = authorization.partition(" ")
+        return scheme in ("Api-Key", "Bearer") and hmac.compare_digest(token.encode(), self._settings.token.encode())
+
+    def _serve_client(self, connection: ServerConnection) -> None:
+        """Serves one client until it leaves or is disconnected."""
+        if not self._places.acquire(blocking=False):
+            connection.send(f"all {self._settings.clients} places are taken; try again later")
+            connection.close(CloseCode.TRY_AGAIN_LATER, "all places are taken")
+            return
+        try:
+            connection.send(pack(self.metadata))
+            self._answer_messages(connection, Session(self.environment, self._frames))
+        except TimeoutError:
+            connection.close(CloseCode.GOING_AWAY, f"no message for {self._settings.idle_minutes:g} minutes")
+        except (ConnectionClosed, CancelledError, EngineClosedError):
+            pass
+        finally:
+            self._places.release()
+
+    def _answer_messages(self, connection: ServerConnection, session: Session) -> None:
+        strikes = 0
+        while strikes < STRIKES:
+            data = connection.recv(60 * self._settings.idle_minutes)
+            began = time.monotonic()
+            try:
+                if isinstance(data, str):
+                    raise WireError("a message is binary, a map in msgpack; this one is text")
+                reply = session.answer(unpack(data))
+            except UserError as error:
+                strikes += 1
+                connection.send(first_line(error))
+                continue
+            except (CancelledError, EngineClosedError):
+                raise
+            except Exception:
+                traceback.print_exc()
+                connection.send("the server failed at this message; its terminal says why")
+                connection.close(CloseCode.INTERNAL_ERROR, "the server failed")
+                return
+            strikes = 0
+            reply["server_timing"] = {"infer_ms": 1000 * (time.monotonic() - began)}
+            connection.send(pack(reply))
+        connection.close(CloseCode.POLICY_VIOLATION, f"{STRIKES} messages in a row could not be answered")
+
+
+def _usual_lanes() -> int:
+    if on_cpu():
+        return 1
+    return ACCELERATOR_LANES
+
+
+def serve_world(run: PlayRun, settings: WorldServerSettings) -> None:
+    """Serves a run until Ctrl-C.
+
+    Raises:
+        UserError: the run cannot be served, or the address is taken.
+    """
+    listener = listen(settings.host, settings.port)
+    world = WorldServer(run, settings)
+    if run.missing:
+        note(f"no clips to begin with ({run.missing}); a reset needs a frame of its own")
+    prepare(run, world.engine)
+    server = world.open(listener)
+    host = settings.host
+    if ":" in host:
+        host = f"[{host}]"
+    print(f"ws://{host}:{listener.getsockname()[1]}  (Ctrl-C ends it)", flush=True)
+    print("next: docs/serve.md has ten lines of client code; curl http://…/healthz says whether it runs", flush=True)
+    with suppress(KeyboardInterrupt):
+        server.serve_forever()
+    world.close()
+    server.shutdown()
