@@ -15,7 +15,7 @@ COMMANDS = {  # each is a module of this package with a function main
     "Data": ("doctor", "ingest", "inspect", "store", "export"),
     "Evaluate": ("evaluate", "compare", "ablation", "paper", "results"),
     "Policies": ("record", "adapt", "judge", "synthesize", "policy_learning", "policy_evaluation", "improve", "plan"),
-    "Models": ("save", "hub", "describe", "compile", "bench", "convert", "replay"),
+    "Models": ("serve", "save", "hub", "describe", "compile", "bench", "convert", "replay"),
 }
 
 

@@ -7,7 +7,7 @@ Importing this package registers the environments with Gymnasium::
     gymnasium.make("rsjax/WorldModel-v0", run="runs/tiny")
     gymnasium.make_vec("rsjax/WorldModel-v0", num_envs=64, run="runs/tiny")
     gymnasium.make("rsjax/Lift-v0")
-    gymnasium.make("rsjax/RemoteWorldModel-v0", url="ws://127.0.0.1:8643")  # served by experiments.serve
+    gymnasium.make("rsjax/RemoteWorldModel-v0", url="ws://127.0.0.1:8643")  # served by rsjax serve
 """
 
 from typing import TYPE_CHECKING, Any

@@ -25,7 +25,7 @@ class ServerError(UserError):
 
 
 class WorldClient:
-    """A connection to a world model that ``experiments.serve`` serves: one episode, and any number of whole videos.
+    """A connection to a world model that ``rsjax serve`` serves: one episode, and any number of whole videos.
 
     Args:
         url: the address that the server printed.
@@ -54,9 +54,7 @@ class WorldClient:
             body = (error.response.body or b"").decode(errors="replace").strip()
             raise ServerError(f"{url}: {body or error}") from error
         except (OSError, ConnectionClosed) as error:
-            raise ServerError(
-                f"{url}: no server answers ({error}); python -m experiments.serve RUN starts one"
-            ) from error
+            raise ServerError(f"{url}: no server answers ({error}); rsjax serve RUN starts one") from error
         try:
             self.metadata = self._receive()
         except UserError:

@@ -332,7 +332,7 @@ def test_where_nobody_serves_the_client_says_what_to_do() -> None:
         port = taken.getsockname()[1]
     with pytest.raises(UserError) as error:
         WorldClient(f"ws://127.0.0.1:{port}")
-    assert "experiments.serve RUN starts one" in str(error.value)
+    assert "rsjax serve RUN starts one" in str(error.value)
 
 
 def test_the_documented_client_runs(url: str) -> None:
