@@ -14,12 +14,13 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float32
 
+from rsjax.clip import GENERATED, GENERATED_MARK
 from rsjax.config.fields import require_range
 from rsjax.data.clips import frame_rate, keeps_rate, readable
 from rsjax.data.codec import Record
 from rsjax.data.store import Store, StoreError
 from rsjax.errors import UserError
-from rsjax.files import disk_guard, making, replace_directory
+from rsjax.files import disk_guard, making, replace_directory, write_json
 from rsjax.progress import note
 from rsjax.tools.export.lerobot_files import (
     LayoutV21,
@@ -31,6 +32,7 @@ from rsjax.tools.export.lerobot_files import (
 )
 
 LAYOUTS: dict[str, type[LayoutV30 | LayoutV21]] = {"v3.0": LayoutV30, "v2.1": LayoutV21}
+PROVENANCE = "provenance.json"  # beside info.json, where LeRobot reads no other file: which episodes a model generated
 CONTROLS = ("delta_x", "delta_y", "delta_z", "delta_roll", "delta_pitch", "delta_yaw", "gripper")  # of simulated Lift
 # Names of a constant state's numbers; from one number LeRobot would make (B, T), but its policies want (B, T, D).
 ZEROS = ("zero_0", "zero_1")
@@ -82,6 +84,8 @@ def export_lerobot(
     Raises:
         UserError: ``out`` exists, the store has no clips, or their sizes or frame rates differ or do not suit a video.
         FileError: the disk is full, or ``out`` cannot be written.
+
+    If a world model generated some of the clips, ``meta/provenance.json`` lists these episodes.
     """
     if out.exists():
         raise UserError(f"{out}: exists; choose another place for the data set, or move it away")
@@ -107,6 +111,7 @@ def _write(store: Store, root: Path, options: LeRobotOptions, report: Callable[[
     total = sum(len(store.source(name)) for name in names)
     layout = None
     splits = {}
+    generated: list[int] = []
     cameras: dict[str, None] = {}
     for name in names:
         if layout:
@@ -126,12 +131,17 @@ def _write(store: Store, root: Path, options: LeRobotOptions, report: Callable[[
                     f"export them from stores of their own, or give --fps"
                 )
             cameras[_camera(clip)] = None
+            if clip["provenance"].get("source") == GENERATED:
+                generated.append(layout.episodes)
             layout.add(episode)
             report(layout.episodes, total)
         if layout is not None and layout.episodes > begins:
             splits[name] = f"{begins}:{layout.episodes}"
     if layout is None:
         raise StoreError(f"{store.path}: has no readable clip of split {options.split}")
+    if generated:
+        mark = {"generated_episodes": generated, "episodes": layout.episodes, "note": GENERATED_MARK}
+        write_json(root / "meta" / PROVENANCE, mark)
     if len(cameras) > 1:
         note(f"{store.path}: has clips of the cameras {', '.join(cameras)}; all are in {layout.camera}")
     return layout.finish({"codebase_version": options.version, "robot_type": options.robot, "splits": splits})

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image
 
-from rsjax.clip import Video
+from rsjax.clip import GENERATED_MARK, Video
 from rsjax.config import Config
 from rsjax.data.clips import Clips
 from rsjax.data.store import Record, Source
@@ -97,7 +97,8 @@ def write_videos(
         name = f"{request.split}_{number:03d}{'' if foreign is None else '_other_actions'}"
         path = out / f"{name}{'' if request.frames is None else f'_{request.frames}_frames'}.{kind}"
         frames = made.rgb[0] if alone else _side_by_side(clip, made, number)
-        (write_mp4 if kind == "mp4" else write_gif)(path, frames, fps, scale if alone else 1)
+        write = write_mp4 if kind == "mp4" else write_gif
+        write(path, frames, fps, scale if alone else 1, GENERATED_MARK)
         yield path
 
 

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
+from rsjax.clip import GENERATED, GENERATED_MARK
 from rsjax.data.build import write_clips
 from rsjax.errors import UserError, first_line, storage_limit
 from rsjax.tools.play.messages import Refused
@@ -85,7 +86,8 @@ def record(session: Session, path: Path, number: int, panes: list[str], fps: flo
     gap = np.zeros((len(nodes), side, GAP, 3), np.uint8)
     parts = [part for column in columns for part in (gap, column)][1:]
     with _writing():
-        (write_gif if path.suffix == ".gif" else write_mp4)(path, np.concatenate(parts, axis=2), fps, scale)
+        write = write_gif if path.suffix == ".gif" else write_mp4
+        write(path, np.concatenate(parts, axis=2), fps, scale, GENERATED_MARK)
 
 
 def pane_frames(session: Session, nodes: list[Node], pane: str) -> UInt8[np.ndarray, "T S S 3"]:
@@ -162,7 +164,7 @@ def _clip(session: Session, branch: Branch, first: int, length: int) -> dict[str
     if session.has_depth:
         made["depth"] = np.maximum(np.stack([_depth(session, node) for node in nodes]), 1e-3)
     made["provenance"] = {
-        "source": "generated",
+        "source": GENERATED,
         "family": run.data.config.model.family,
         "model": run.fingerprint,
         "from": {"key": str(manifest.get("key")), "split": run.split, "clip": clip, "episode": origin.get("episode")},

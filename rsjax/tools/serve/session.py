@@ -31,7 +31,7 @@ class Session:
         self._most = most_frames
         self._env = make()
         self._frame = -1  # number of the current one; -1 before the first reset
-        self._answers = {"reset": self._reset, "step": self._step, "generate": self._generate}
+        self._answers = {"reset": self.reset, "step": self.step, "generate": self.generate}
 
     def answer(self, message: dict[str, Any]) -> dict[str, Any]:
         """Does what a message asks for.
@@ -47,13 +47,15 @@ class Session:
         except Refused as error:
             raise WireError(error.message) from error
 
-    def _reset(self, fields: dict[str, Any]) -> dict[str, Any]:
+    def reset(self, fields: dict[str, Any]) -> dict[str, Any]:
+        """Begins an episode."""
         _check_names(fields, START)
         observation, info = _begin(self._env, fields)
         self._frame = 0
         return observation | info | {"frame": 0}
 
-    def _step(self, fields: dict[str, Any]) -> dict[str, Any]:
+    def step(self, fields: dict[str, Any]) -> dict[str, Any]:
+        """Generates the episode's next frame."""
         _check_names(fields, ("action",))
         if self._frame < 0:
             raise WireError("a step comes after a reset")
@@ -64,7 +66,7 @@ class Session:
         facts = {"frame": self._frame, "reward": reward, "terminated": terminated, "truncated": truncated}
         return observation | info | facts
 
-    def _generate(self, fields: dict[str, Any]) -> dict[str, Any]:
+    def generate(self, fields: dict[str, Any]) -> dict[str, Any]:
         """Generates a whole video; the client's episode stays as it is.
 
         The field "actions" is (T, A); row t leads into frame t, and row 0 is not read.

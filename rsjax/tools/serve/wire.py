@@ -29,7 +29,7 @@ def pack(message: dict[str, Any]) -> bytes:
         WireError: it has an array of objects, or something else that cannot be sent.
     """
     try:
-        packed: bytes = msgpack.packb(message, default=_pack_array)
+        packed: bytes = msgpack.packb(message, default=pack_array)
     except (TypeError, ValueError, OverflowError) as error:
         raise WireError(f"this message cannot be sent: {error}") from error
     return packed
@@ -42,7 +42,7 @@ def unpack(data: bytes) -> dict[str, Any]:
         WireError: it is not a map in msgpack, or has an array of another type than truth values, integers and floats.
     """
     try:
-        message = msgpack.unpackb(data, object_hook=_unpack_array)
+        message = msgpack.unpackb(data, object_hook=unpack_array)
     except (ValueError, TypeError, msgpack.UnpackException) as error:
         raise WireError(
             f"a message is a map in msgpack; this one cannot be read ({error or 'it ends too early'})"
@@ -52,7 +52,8 @@ def unpack(data: bytes) -> dict[str, Any]:
     return message
 
 
-def _pack_array(value: Any) -> Any:
+def pack_array(value: Any) -> Any:
+    """Returns an array or a numpy scalar as a map; msgpack calls it for what it does not know."""
     if not isinstance(value, np.ndarray | np.generic):
         raise TypeError(f"{type(value).__name__} is neither an array nor plain data")
     if not DTYPE.fullmatch(value.dtype.str):
@@ -62,9 +63,18 @@ def _pack_array(value: Any) -> Any:
     return {b"__npgeneric__": True, b"data": value.item(), b"dtype": value.dtype.str}
 
 
-def _unpack_array(value: dict[Any, Any]) -> Any:
+def unpack_array(value: dict[Any, Any]) -> Any:
+    """Returns the array or the scalar that a map stands for, or the map itself; msgpack calls it for every map."""
     if b"__ndarray__" in value:
-        return _array(value.get(b"data"), _dtype(value), value.get(b"shape"))
+        data = value.get(b"data")
+        shape = value.get(b"shape")
+        axes_fit = isinstance(shape, list | tuple) and len(shape) <= MOST_AXES
+        if not axes_fit or not all(type(side) is int and 0 <= side < 2**31 for side in shape):
+            raise WireError(f"an array has the shape {shape!r:.60}; it is a list of at most {MOST_AXES} whole numbers")
+        dtype = _dtype(value)
+        if not isinstance(data, bytes) or len(data) != math.prod(shape) * dtype.itemsize:
+            raise WireError(f"an array of shape {tuple(shape)} and type {dtype} has another number of bytes")
+        return np.frombuffer(data, dtype).reshape(shape).copy()
     if b"__npgeneric__" in value:
         number = value.get(b"data")
         if not isinstance(number, bool | int | float):
@@ -74,15 +84,6 @@ def _unpack_array(value: dict[Any, Any]) -> Any:
         except OverflowError as error:
             raise WireError(f"{number} does not fit into {_dtype(value)}") from error
     return value
-
-
-def _array(data: Any, dtype: np.dtype[Any], shape: Any) -> np.ndarray:
-    axes_fit = isinstance(shape, list | tuple) and len(shape) <= MOST_AXES
-    if not axes_fit or not all(type(side) is int and 0 <= side < 2**31 for side in shape):
-        raise WireError(f"an array has the shape {shape!r:.60}; it is a list of at most {MOST_AXES} whole numbers")
-    if not isinstance(data, bytes) or len(data) != math.prod(shape) * dtype.itemsize:
-        raise WireError(f"an array of shape {tuple(shape)} and type {dtype} has another number of bytes")
-    return np.frombuffer(data, dtype).reshape(shape).copy()
 
 
 def _dtype(value: dict[Any, Any]) -> np.dtype[Any]:

@@ -13,11 +13,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import rsjax
+from rsjax.clip import GENERATED, GENERATED_MARK
 from rsjax.data.merge import merge
 from rsjax.data.store import Store
 from rsjax.errors import UserError
 from rsjax.tools.export import lerobot_files
-from rsjax.tools.export.lerobot import LeRobotOptions, export_lerobot
+from rsjax.tools.export.lerobot import PROVENANCE, LeRobotOptions, export_lerobot
 from rsjax.tools.ingest.ingest import ingest
 from rsjax.tools.ingest.options import IngestOptions, make_plan
 from rsjax.tools.ingest.windows import WindowConfig
@@ -77,6 +78,15 @@ def test_what_is_exported_is_read_back(
         states = {"zeros": np.zeros((frames, 2), np.float32), "command": clip["actions"], "none": None}[state]
         np.testing.assert_array_equal(episode.states, states) if state != "none" else None
         assert (episode.states is None) == (state == "none")
+
+
+def test_episodes_that_a_model_generated_are_listed(tmp_path: Path) -> None:
+    export_lerobot(toy_store(tmp_path / "real"), tmp_path / "one", LeRobotOptions(crf=1))
+    assert not (tmp_path / "one" / "meta" / PROVENANCE).exists()
+    made = toy_store(tmp_path / "generated", provenance={"source": GENERATED})
+    info = export_lerobot(made, tmp_path / "other", LeRobotOptions(crf=1))
+    mark = json.loads((tmp_path / "other" / "meta" / PROVENANCE).read_text())
+    assert mark["generated_episodes"] == list(range(info["total_episodes"])) and mark["note"] == GENERATED_MARK
 
 
 @pytest.mark.parametrize("version", ["v3.0", "v2.1"])

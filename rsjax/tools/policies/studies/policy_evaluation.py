@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from rsjax.clip import GENERATED_MARK
 from rsjax.errors import UserError
 from rsjax.evaluation.coverage import UNSEEN
 from rsjax.evaluation.prediction_powered import corrected_rate
@@ -167,7 +168,8 @@ def _videos(out: Path, run: str, name: str, trials: Trials) -> None:
         files = [out / world / name / f"episode-{number:02d}.npz" for world in ("simulator", run)]
         if all(file.exists() for file in files):
             sides = [np.load(file)["rgb"] for file in files]
-            write_mp4(out / "videos" / f"{run}-{name}-{number:02d}.mp4", side_by_side(sides), FPS, 4)
+            path = out / "videos" / f"{run}-{name}-{number:02d}.mp4"
+            write_mp4(path, side_by_side(sides), FPS, 4, f"Left: the simulator. Right: {GENERATED_MARK}")
 
 
 def compared(

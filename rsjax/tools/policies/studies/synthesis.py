@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 
 from rsjax.artifact import make_once
+from rsjax.clip import GENERATED
 from rsjax.config import content_key
 from rsjax.data.build import write_clips
 from rsjax.data.clips import Clips, frame_rate, keeps_rate, readable
@@ -93,7 +94,7 @@ def synthesize(
         UserError: the data set has no suitable clip, does not fit the model, or ``out`` holds other clips.
     """
     inputs = (model_key(trained), judge_key(judge), fingerprint(((limits.low, limits.high),)))
-    key = content_key(4, *inputs, str(store.manifest.get("key")), str(asdict(options)))
+    key = content_key(5, *inputs, str(store.manifest.get("key")), str(asdict(options)))
     finished = _finished(out, key)
     if finished is not None:
         return finished
@@ -200,8 +201,9 @@ def _generated(
             made["success"] = found[row] == SUCCESS
         origin = clip["provenance"]
         made["provenance"] = {
-            "source": "generated",
+            "source": GENERATED,
             "family": trained.config.model.family,
+            "model": model_key(trained),
             "from": {"key": str(store.manifest.get("key")), "split": options.split, "episode": origin.get("episode")},
             "noise": options.noise,
             "seed": options.seed,

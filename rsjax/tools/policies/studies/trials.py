@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 
 from rsjax.artifact import make_once
+from rsjax.clip import GENERATED_MARK
 from rsjax.config import SimConfig, content_key
 from rsjax.errors import UserError
 from rsjax.evaluation.statistics import Estimate, wilson
 from rsjax.files import write_file
 from rsjax.progress import Progress
 from rsjax.tools.policies.policy import Policy
-from rsjax.tools.policies.worlds.model_world import FirstFrame
+from rsjax.tools.policies.worlds.model_world import FirstFrame, ModelWorld
 from rsjax.tools.policies.worlds.simulator_world import SimulatorWorld
 from rsjax.tools.policies.worlds.world import FIRST_SEED, World, run_episodes
 from rsjax.tools.studies.report.video import write_mp4
@@ -105,6 +106,9 @@ def try_policy(
         uninterpretable = work.metadata.setdefault("uninterpretable", [])
         unfamiliarity = work.metadata.setdefault("unfamiliarity", [])
         clipped = work.metadata.get("clipped", 0)
+        comment = ""
+        if isinstance(world, ModelWorld):
+            comment = GENERATED_MARK
         with Progress(f"{name}: trials", len(starts), "episodes", len(success)) as progress:
             # An episode's draws depend on its group, so a resumed series continues at a multiple of ``together``.
             for first in range(len(success), len(starts), world.count):
@@ -116,7 +120,7 @@ def try_policy(
                     uninterpretable.append(episode.uninterpretable)
                     clipped += episode.clipped
                     if number < trials.videos:
-                        write_mp4(folder / f"episode-{number:02d}.mp4", episode.rgb, FPS, 4)
+                        write_mp4(folder / f"episode-{number:02d}.mp4", episode.rgb, FPS, 4, comment)
                     if number < save_frames:
                         save_arrays(folder / f"episode-{number:02d}.npz", rgb=episode.rgb)
                 work.save(

@@ -21,7 +21,9 @@ _HOLD = 4  # a GIF's last frame lasts this many times as long as the others
 _H264 = {"crf": "16"}  # constant rate factor: 0 is lossless, 23 the default
 
 
-def write_mp4(path: Path, frames: UInt8[np.ndarray, "T H W 3"], fps: float, upscale: int = 1) -> None:
+def write_mp4(
+    path: Path, frames: UInt8[np.ndarray, "T H W 3"], fps: float, upscale: int = 1, comment: str = ""
+) -> None:
     """Writes an H.264 (yuv420p) video that browsers and players can open.
 
     Args:
@@ -29,6 +31,7 @@ def write_mp4(path: Path, frames: UInt8[np.ndarray, "T H W 3"], fps: float, upsc
         frames: 0–255, RGB. If a side is odd, its last row or column is repeated, since yuv420p needs even sides.
         fps: frames per second, above 0.
         upscale: side of the square of pixels that each pixel becomes.
+        comment: of the file's metadata, such as :data:`rsjax.clip.GENERATED_MARK`.
 
     Raises:
         ValueError: the frames have another shape or dtype, there are none, or the frame rate is not positive.
@@ -39,6 +42,8 @@ def write_mp4(path: Path, frames: UInt8[np.ndarray, "T H W 3"], fps: float, upsc
     frames = np.pad(frames, ((0, 0), (0, height % 2), (0, width % 2), (0, 0)), mode="edge")
     buffer = io.BytesIO()
     with av.open(buffer, "w", format="mp4") as container:
+        if comment:
+            container.metadata["comment"] = comment
         stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1000), options=_H264)
         stream.height, stream.width = frames.shape[1:3]
         stream.pix_fmt = "yuv420p"
@@ -48,14 +53,16 @@ def write_mp4(path: Path, frames: UInt8[np.ndarray, "T H W 3"], fps: float, upsc
     write_file(path, buffer.getvalue())
 
 
-def write_gif(path: Path, frames: UInt8[np.ndarray, "T H W 3"], fps: float, upscale: int = 1) -> None:
+def write_gif(
+    path: Path, frames: UInt8[np.ndarray, "T H W 3"], fps: float, upscale: int = 1, comment: str = ""
+) -> None:
     """Writes a GIF that loops and shows its last frame longer. Arguments and errors as in :func:`write_mp4`."""
     _check(frames, fps)
     milliseconds = round(1000 / fps)
     durations = [milliseconds] * (len(frames) - 1) + [milliseconds * _HOLD]
     first, *rest = [Image.fromarray(frame) for frame in resize(frames, upscale, "nearest")]
     buffer = io.BytesIO()
-    first.save(buffer, "GIF", save_all=True, append_images=rest, duration=durations, loop=0)
+    first.save(buffer, "GIF", save_all=True, append_images=rest, duration=durations, loop=0, comment=comment.encode())
     write_file(path, buffer.getvalue())
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from rsjax.clip import GENERATED_MARK
 from rsjax.tools.studies.report.video import resize, webp_uri, write_gif, write_mp4
 
 _COLORS = np.array([[200, 40, 40], [40, 180, 60], [40, 60, 200], [220, 220, 220], [20, 20, 20]], np.uint8)
@@ -43,6 +44,16 @@ def test_mp4_keeps_the_picture_upright_and_rgb(tmp_path):
     np.testing.assert_allclose(read[8, 8], (255, 0, 0), atol=12)
     np.testing.assert_allclose(read[56, 56], (0, 0, 255), atol=12)
     np.testing.assert_allclose(read[8, 56], 0, atol=12)
+
+
+def test_a_comment_is_in_the_metadata_of_both_kinds(tmp_path):
+    frames = _flat_frames(16, 16)
+    write_mp4(tmp_path / "a.mp4", frames, 5, comment=GENERATED_MARK)
+    write_gif(tmp_path / "a.gif", frames, 5, comment=GENERATED_MARK)
+    with av.open(tmp_path / "a.mp4") as container:
+        assert container.metadata["comment"] == GENERATED_MARK
+    with Image.open(tmp_path / "a.gif") as image:
+        assert image.info["comment"].decode() == GENERATED_MARK
 
 
 def test_gif_loops_in_order(tmp_path):
