@@ -6,7 +6,7 @@ python := $(VENV)/bin/python
 # When a test ends its process, the run ends, too: in a new process, xdist would run the same test again.
 in_parallel := -n $(JOBS) --max-worker-restart 0
 
-.PHONY: help setup train test wheel-test extras accelerators accelerators-test lint clean
+.PHONY: help setup train test wheel-test extras accelerators accelerators-test lint docs clean
 
 help:  ## this list
 	@sed -n 's/^\([a-z-]*\):[^#]*## /make \1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 24
@@ -40,6 +40,10 @@ lint: setup  ## ruff, mypy, and the numbers that may only fall
 	@$(python) -m mypy
 	@$(python) -m scripts.ratchets
 
+docs: setup  ## the documentation as a site, in site/; open site/index.html
+	@$(python) -c 'import mkdocstrings, material' 2>/dev/null || $(python) -m pip install --quiet --progress-bar off -c requirements.txt -r requirements-docs.txt
+	@NO_MKDOCS_2_WARNING=1 $(python) -m mkdocs build --strict --quiet $(ARGS)
+
 clean:  ## removes the environment and the caches; data and runs stay
-	@rm -rf "$(VENV)" build rsjax.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	@rm -rf "$(VENV)" build site rsjax.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
 	@find rsjax experiments benchmarks scripts tests -name __pycache__ -prune -exec rm -rf {} +

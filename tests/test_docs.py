@@ -5,11 +5,14 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
+import yaml
 
 ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")), *sorted((ROOT / "notebooks").rglob("*.md"))]
+PROJECT = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "SECURITY.md")]
+PAGES = [*PROJECT, *sorted((ROOT / "docs").rglob("*.md")), *sorted((ROOT / "notebooks").rglob("*.md"))]
 USER_PAGES = sorted((ROOT / "docs").rglob("*.md"))
 LONGEST = 200  # lines of a page for users
 FOLDER_README = 15  # lines of a folder's README
@@ -74,3 +77,25 @@ def test_the_index_names_every_page() -> None:
 @pytest.mark.parametrize("readme", folder_readmes(), ids=name_of)
 def test_readmes_of_folders_are_short(readme: Path) -> None:
     assert len(readme.read_text().splitlines()) <= FOLDER_README
+
+
+def pages_of(navigation: Any) -> list[str]:
+    """Returns the pages that a navigation of MkDocs names."""
+    if isinstance(navigation, str):
+        return [navigation]
+    parts = navigation.values() if isinstance(navigation, dict) else navigation
+    return [page for part in parts for page in pages_of(part)]
+
+
+def test_the_sites_navigation_names_every_page_once() -> None:
+    settings = yaml.safe_load((ROOT / "mkdocs.yml").read_text())
+    pages = [page for page in pages_of(settings["nav"]) if not page.startswith("project/")]
+    assert sorted(pages) == sorted(page.relative_to(ROOT / "docs").as_posix() for page in USER_PAGES)
+    assert settings["strict"] and "offline" in settings["plugins"]
+    assert list(map(next, map(iter, settings["nav"]))) == [
+        "Start here",
+        "How-to",
+        "Reference",
+        "Explanation",
+        "Lab results",
+    ]

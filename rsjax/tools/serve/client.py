@@ -111,7 +111,8 @@ class RemoteWorldModelEnv(gymnasium.Env[Any, Any]):
     """A served world model as an environment like :class:`rsjax.tools.policies.WorldModelEnv`.
 
     Args:
-        url, token: as for :class:`WorldClient`.
+        url: as for :class:`WorldClient`.
+        token: as for :class:`WorldClient`.
         max_steps: steps after which an episode is truncated; at most the server's limit.
         render_mode: "rgb_array", or None.
 
