@@ -137,6 +137,11 @@ def _exit(line: str, status: int) -> None:
     raise SystemExit(status)
 
 
+def is_lead() -> bool:
+    """Says whether this is the only process of a command, or the first one of several."""
+    return not _has_peers() or sys.modules["jax"].process_index() == 0
+
+
 def _has_peers() -> bool:
     jax = sys.modules.get("jax")
     # A signal may have interrupted jax's import.

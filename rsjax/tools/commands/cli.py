@@ -4,19 +4,22 @@ import contextlib
 import dataclasses
 import io
 import os
-from collections.abc import Sequence
+import re
+import sys
+import time
+from collections.abc import Iterator, Sequence
 from operator import attrgetter
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_args, get_type_hints
 
 import tyro
 
-from rsjax.command import main_errors as main_errors  # every command imports main_errors and a parser from here
-from rsjax.command import refuse_repeated
+from rsjax import command
 from rsjax.config import Config, ConfigError, CurriculumStageConfig, check_numbers, presets, require
 from rsjax.config.config_fields import config_fields, with_sections, with_values
 from rsjax.config.curriculum import read_curriculum, write_curriculum
 from rsjax.errors import did_you_mean
+from rsjax.tools.commands.first_screens import FIRST_SCREENS
 
 Options = TypeVar("Options")
 
@@ -110,10 +113,11 @@ def parse(argv: Sequence[str], prog: str, description: str, options: Options) ->
     if not argv or argv[0].startswith("-"):
         if not {"-h", "--help", "--help-all"}.intersection(argv):
             raise ConfigError(f"name a preset first; {usage}")
-        print(f"{usage}\n{description}\nOptions and common fields: {prog} tiny --help; every field: --help-all")
+        more = f"Options and common fields: {prog} tiny --help; every field: --help-all"
+        print(usage, with_first_screen(f"\n{description}", prog, _help_of_tiny(prog, options)), more, sep="\n")
         raise SystemExit(0)
     name, *argv = argv
-    refuse_repeated(argv, _adding(options))
+    command.refuse_repeated(argv, _adding(options))
     prog = f"{prog} {name}"
     preset = presets.get(name)
     preset_options = _parse({"preset": PresetOptions()}, argv, prog, "", rest=True).preset
@@ -133,6 +137,7 @@ def parse(argv: Sequence[str], prog: str, description: str, options: Options) ->
         argv = ["--help"]
     parsed = _parse({"options": options, "preset": preset_options, "fields": fields}, argv, prog, description)
     config: Config = parsed.fields
+    _remember(prog, parsed.options, getattr(parsed.options, "run_dir", None) or Path("runs") / config.name)
     for name in ("train", "tokenizer_train"):
         loop = getattr(config, name)
         flag = f"--{name.replace('_', '-')}"
@@ -177,8 +182,91 @@ def choose_sections(preset: Config, argv: Sequence[str]) -> tuple[Config, list[s
 
 def parse_options(argv: Sequence[str], prog: str, description: str, options: Options) -> Options:
     """Parses the arguments of a command without a preset. Arguments and errors as in :func:`parse`."""
-    refuse_repeated(argv, _adding(options))
-    return _parse({"options": options}, argv, prog, description).options
+    command.refuse_repeated(argv, _adding(options))
+    if {"-h", "--help"}.intersection(argv):
+        text = _help({"options": options}, prog, description)
+        head, line, body = text.partition("\n positional arguments")
+        if not line:
+            head, line, body = text.partition("\n options")
+        print(f"{with_first_screen(head, prog, text)}\n{line}{body}", end="")
+        raise SystemExit(0)
+    parsed = _parse({"options": options}, argv, prog, description).options
+    _remember(prog, parsed)
+    return parsed
+
+
+def with_first_screen(head: str, prog: str, text: str) -> str:
+    """Returns the head of a command's help with its example, output and most used options.
+
+    Args:
+        head: the usage and the description.
+        prog: the command as the user types it; one without a first screen keeps the head as it is.
+        text: the whole help, which describes the options.
+    """
+    screen = FIRST_SCREENS.get(_name(prog))
+    if screen is None:
+        return head
+    lines = [head.rstrip(), "", f"Example:  {screen.example}", f"Output:   {screen.output}"]
+    if screen.takes:
+        lines.append(f"Time:     {screen.takes}")
+    if screen.used:
+        lines += ["", "Used most:"]
+    for option in screen.used:
+        found = re.search(rf"^  (?:-\w, )?--{re.escape(option)}(?:[ ,\n].*\n?)(?:   .*\n)*", text, re.MULTILINE)
+        assert found is not None, f"{prog} has no option --{option}"
+        lines += [line.rstrip() for line in found[0].splitlines()]
+    return "\n".join(lines)
+
+
+@contextlib.contextmanager
+def main_errors() -> Iterator[None]:
+    """Does what :func:`rsjax.command.main_errors` does, and says at the end how long it took and what to do next.
+
+    The last line is on standard error, so that a program can read what the command prints. Of several processes that
+    train together, the first one says it.
+    """
+    began = time.monotonic()
+    with command.main_errors():
+        _called.clear()
+        yield
+        screen = FIRST_SCREENS.get(_called.get("name", ""))
+        if screen is None or not screen.following or not command.is_lead():
+            return
+        from rsjax.progress import duration
+
+        following = screen.following.format(run=_called["run"])
+        print(f"done in {duration(time.monotonic() - began)}; next: {following}", file=sys.stderr)
+
+
+_called: dict[str, str] = {}  # the command that runs, and what it runs on
+
+
+def _remember(prog: str, options: Any, run: Path | None = None) -> None:
+    """Notes what the command was called with, for its last line."""
+    for name in ("run", "runs", "store"):
+        value = getattr(options, name, None)
+        if run is None and value:
+            run = value[0] if isinstance(value, tuple) else value
+    _called.update(name=_name(prog), run=str(run or "RUN"))
+
+
+def _name(prog: str) -> str:
+    """Returns the name of a command as the user types it: play, of ``rsjax play``."""
+    return [*prog.split(), "", ""][1]
+
+
+def _help_of_tiny(prog: str, options: Any) -> str:
+    """Returns the help of a command for the preset tiny."""
+    tiny = presets.get("tiny")
+    return _help({"options": options, "preset": PresetOptions(), "fields": _first_fields(tiny)}, prog, "")
+
+
+def _help(parts: dict[str, Any], prog: str, description: str) -> str:
+    """Returns the help for these parts."""
+    text = io.StringIO()
+    with contextlib.redirect_stdout(text), contextlib.suppress(SystemExit):
+        _parse(parts, ["--help"], prog, description)
+    return text.getvalue()
 
 
 def part(options: Any, kind: type[Options]) -> Options:

@@ -10,7 +10,7 @@ import tyro
 from tyro.conf import Positional, arg
 
 from rsjax.config import ConfigError
-from rsjax.tools.commands.cli import main_errors, parse_options
+from rsjax.tools.commands.cli import main_errors, parse_options, with_first_screen
 
 PROG = "rsjax hub"
 USAGE = f"usage: {PROG} push MODEL USER/NAME, or {PROG} pull USER/NAME MODEL"
@@ -45,7 +45,7 @@ def main() -> None:
     """Copies one model, and prints where it is."""
     word, *argv = sys.argv[1:] or [""]
     if word in ("-h", "--help"):
-        print(USAGE)
+        print(with_first_screen(USAGE, PROG, ""))
         return
     if word not in ACTIONS:
         raise ConfigError(USAGE)

@@ -17,7 +17,7 @@ class Options:
     """Serves a run's world model to programs: reset, step and generate, as openpi serves policies (docs/serve.md)."""
 
     run: tyro.conf.Positional[Path] = tyro.MISSING
-    """A run directory, made by rsjax train."""
+    """A run directory, made by rsjax train, or tiny, the model in the package."""
     data_dir: Path = Path("data")
     """Directory of simulated data sets."""
     store: Path | None = None
@@ -43,6 +43,7 @@ def main() -> None:
     """Serves until Ctrl-C."""
     tune_process()
     options = parse_options(sys.argv[1:], "rsjax serve", Options.__doc__ or "", Options())
+    from rsjax.model_directory import locate
     from rsjax.tools.play.play_run import PlayRun
     from rsjax.tools.policies.run_data import RunData
     from rsjax.tools.serve.server import WorldServerSettings, serve_world
@@ -56,4 +57,5 @@ def main() -> None:
         frames=options.frames,
         idle_minutes=options.idle_minutes,
     )
-    serve_world(PlayRun(RunData(options.run, options.data_dir, options.store), options.split), settings)
+    data = RunData(locate(options.run), options.data_dir, options.store)
+    serve_world(PlayRun(data, options.split), settings)

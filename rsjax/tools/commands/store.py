@@ -11,7 +11,7 @@ from tyro.conf import Positional, arg
 
 from rsjax.config import ConfigError
 from rsjax.runtime import tune_process
-from rsjax.tools.commands.cli import main_errors, parse_options
+from rsjax.tools.commands.cli import main_errors, parse_options, with_first_screen
 
 PROG = "rsjax store"
 USAGE = (
@@ -59,7 +59,7 @@ def main() -> None:
     """Runs one of the actions and prints the stores that it made."""
     word, *argv = sys.argv[1:] or [""]
     if word in ("-h", "--help"):
-        print(USAGE)
+        print(with_first_screen(USAGE, PROG, ""))
         return
     if word not in ACTIONS:
         raise ConfigError(USAGE)

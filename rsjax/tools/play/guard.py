@@ -3,9 +3,10 @@
 import ipaddress
 import re
 import secrets
+from collections.abc import Mapping
 from dataclasses import dataclass
 
-from starlette.datastructures import Headers, QueryParams
+from starlette.datastructures import Headers
 from starlette.types import ASGIApp as App
 from starlette.types import Message, Receive, Scope, Send
 
@@ -61,7 +62,7 @@ class Guard:
             return ""
         return f"pages of {origin!r:.80} cannot connect"
 
-    def knows(self, query: QueryParams) -> bool:
+    def knows(self, query: Mapping[str, str]) -> bool:
         """Returns whether a request contains the token."""
         given = query.get("token", "")
         return not self.token or secrets.compare_digest(given.encode(), self.token.encode())

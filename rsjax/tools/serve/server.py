@@ -1,7 +1,5 @@
 """The server of a world model: connections, the token, limits, and what it says of itself."""
 
-import hmac
-import http
 import threading
 import time
 import traceback
@@ -12,7 +10,6 @@ from socket import socket as Socket
 from typing import Any
 
 from websockets.exceptions import ConnectionClosed
-from websockets.frames import CloseCode
 from websockets.http11 import Request, Response
 from websockets.sync.server import Server, ServerConnection, serve
 
@@ -23,11 +20,10 @@ from rsjax.devices import on_cpu
 from rsjax.errors import UserError, first_line
 from rsjax.progress import note
 from rsjax.tools.play.engine import Engine, EngineClosedError
-from rsjax.tools.play.guard import is_loopback
+from rsjax.tools.play.guard import Guard, is_loopback
 from rsjax.tools.play.play_run import PlayRun
 from rsjax.tools.play.serve import listen, prepare
 from rsjax.tools.play.session import first_settings
-from rsjax.tools.policies.judges.judge import Judge
 from rsjax.tools.policies.judges.judge_training import judge_of
 from rsjax.tools.policies.worlds.environments import WorldModelEnv
 from rsjax.tools.serve.session import Session
@@ -87,7 +83,6 @@ class WorldServer:
     Args:
         run: the run and its clips.
         settings: address and limits.
-        judge: decides on success; "run": the run's own judge, if it has one.
 
     Attributes:
         engine: generates the frames of all clients.
@@ -97,12 +92,12 @@ class WorldServer:
         UserError: the run is missing or unfinished, or its model takes no actions or cannot generate frame by frame.
     """
 
-    def __init__(self, run: PlayRun, settings: WorldServerSettings, judge: Judge | str = "run") -> None:
+    def __init__(self, run: PlayRun, settings: WorldServerSettings) -> None:
         trained = run.trained
         size = trained.config.clips.image_size
         self._run = run
         self._settings = settings
-        self._judge = judge_of(run.data.run, judge, size)
+        self._judge = judge_of(run.data.run, "run", size)
         lanes = settings.lanes
         if lanes == 0:
             lanes = 1 if on_cpu() else ACCELERATOR_LANES
@@ -117,7 +112,7 @@ class WorldServer:
         """Returns an environment whose steps the engine makes, for one client."""
         data = self._run.data
         return WorldModelEnv(
-            self._run.trained,
+            data,
             imagination=SharedSteps(self.engine, self._decoding),
             data_dir=data.data_dir,
             store=data.moved,
@@ -171,26 +166,25 @@ class WorldServer:
     def refusal(self, connection: ServerConnection, request: Request) -> Response | None:
         """Answers a request for health, and refuses a client without the token; None: the client may connect."""
         if request.path == "/healthz":
-            return connection.respond(http.HTTPStatus.OK, "OK\n")
+            return connection.respond(200, "OK\n")
         scheme, _, token = request.headers.get("Authorization", "").partition(" ")
-        known = scheme in ("Api-Key", "Bearer") and hmac.compare_digest(token.encode(), self._settings.token.encode())
-        if self._settings.token and not known:
-            return connection.respond(
-                http.HTTPStatus.UNAUTHORIZED, "this server wants its token in Authorization: Api-Key TOKEN\n"
-            )
+        if scheme not in ("Api-Key", "Bearer"):
+            token = ""
+        if not Guard(self._settings.token).knows({"token": token}):
+            return connection.respond(401, "this server wants its token in Authorization: Api-Key TOKEN\n")
         return None
 
     def serve_client(self, connection: ServerConnection) -> None:
         """Serves one client until it leaves or is disconnected."""
         if not self._places.acquire(blocking=False):
             connection.send(f"all {self._settings.clients} places are taken; try again later")
-            connection.close(CloseCode.TRY_AGAIN_LATER, "all places are taken")
+            connection.close(1013, "all places are taken")
             return
         try:
             connection.send(pack(self.metadata))
             self.answer_messages(connection, Session(self.environment, self._frames))
         except TimeoutError:
-            connection.close(CloseCode.GOING_AWAY, f"no message for {self._settings.idle_minutes:g} minutes")
+            connection.close(1001, f"no message for {self._settings.idle_minutes:g} minutes")
         except (ConnectionClosed, CancelledError, EngineClosedError):
             pass
         finally:
@@ -215,12 +209,12 @@ class WorldServer:
             except Exception:
                 traceback.print_exc()
                 connection.send("the server failed at this message; its terminal says why")
-                connection.close(CloseCode.INTERNAL_ERROR, "the server failed")
+                connection.close(1011, "the server failed")
                 return
             strikes = 0
             reply["server_timing"] = {"infer_ms": 1000 * (time.monotonic() - began)}
             connection.send(pack(reply))
-        connection.close(CloseCode.POLICY_VIOLATION, f"{STRIKES} messages in a row could not be answered")
+        connection.close(1008, f"{STRIKES} messages in a row could not be answered")
 
 
 def serve_world(run: PlayRun, settings: WorldServerSettings) -> None:

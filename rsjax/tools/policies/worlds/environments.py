@@ -17,6 +17,7 @@ from jaxtyping import UInt8
 from rsjax.config import SimConfig
 from rsjax.data.state_labels import STATE
 from rsjax.errors import UserError
+from rsjax.model_directory import locate
 from rsjax.models.base import Imagination
 from rsjax.models.load_run import load
 from rsjax.models.trained import TrainedModel
@@ -24,6 +25,7 @@ from rsjax.tools.policies.judges.head_judge import NAME as HEAD
 from rsjax.tools.policies.judges.head_judge import HeadJudge, head_judge
 from rsjax.tools.policies.judges.judge import LABELS, Judge
 from rsjax.tools.policies.judges.judge_training import judge_of
+from rsjax.tools.policies.run_data import RunData
 from rsjax.tools.policies.worlds.actions import OutOfRange, check_out_of_range, check_takes_actions
 from rsjax.tools.policies.worlds.model_world import FirstFrame, ModelWorld
 from rsjax.tools.policies.worlds.simulator_world import SimulatorWorld
@@ -69,7 +71,7 @@ class _Model:
 
     def __init__(
         self,
-        run: Path | str | TrainedModel,
+        run: Path | str | TrainedModel | RunData,
         count: int,
         settings: EnvironmentSettings,
         imagination: Imagination | None = None,
@@ -78,9 +80,13 @@ class _Model:
             trained = run
             folder = Path(".")
             name = "the model"
+        elif isinstance(run, RunData):
+            trained = run.trained
+            folder = run.run
+            name = f"{folder}: the model"
         else:
             trained = load(run)
-            folder = Path(run)
+            folder = locate(run)
             name = f"{run}: the model"
         config = trained.config
         check_takes_actions(config.model, name)
@@ -95,7 +101,7 @@ class _Model:
         if settings.judge == HEAD:
             judge = head_judge(trained, folder)
         else:
-            judge = judge_of(run, settings.judge, size)
+            judge = judge_of(run if isinstance(run, TrainedModel) else folder, settings.judge, size)
         self.world = ModelWorld(trained, count, judge, whole_videos=False, imagination=imagination)
         self.starts = Starts(config, folder, Path(settings.data_dir), store, settings.split, has_depth)
         self.action_space = spaces.Box(self.world.actions.low, self.world.actions.high)
@@ -149,7 +155,7 @@ class WorldModelEnv(gymnasium.Env[Any, Any]):
 
     def __init__(
         self,
-        run: Path | str | TrainedModel,
+        run: Path | str | TrainedModel | RunData,
         render_mode: str | None = None,
         imagination: Imagination | None = None,
         **settings: Any,

@@ -1,0 +1,74 @@
+"""The first minute of every command: its help begins with an example, the output and the options that people use."""
+
+import contextlib
+import importlib
+import sys
+from unittest.mock import patch
+
+import pytest
+
+from rsjax.errors import UserError
+from rsjax.tools.commands.cli import main_errors, parse_options
+from rsjax.tools.commands.first_screens import FIRST_SCREENS
+from rsjax.tools.commands.main import COMMANDS
+from rsjax.tools.commands.replay import Options
+
+NAMES = [name for group in COMMANDS.values() for name in group]
+LINES = 36  # of a terminal, at a width of 100
+# Commands that take minutes or hours. demo, play and serve run until they are stopped.
+LONG = {"train", "ingest", "evaluate", "ablation", "paper", "record", "adapt", "judge", "synthesize", "policy_learning",
+        "policy_evaluation", "improve", "plan", "compile", "bench", "generate", "convert"}  # fmt: skip
+
+
+def test_every_command_has_a_first_screen() -> None:
+    assert sorted(FIRST_SCREENS) == sorted(NAMES)
+    for name in LONG:
+        assert FIRST_SCREENS[name].following, f"{name} takes long, and does not say what to do next"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_help_begins_with_example_output_and_used_options(
+    name: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "100")
+    module = importlib.import_module(f"rsjax.tools.commands.{name}")
+    with patch.object(sys, "argv", [f"rsjax {name}", "--help"]), contextlib.suppress(SystemExit):
+        module.main()
+    first = "\n".join(capsys.readouterr().out.splitlines()[:LINES])
+    screen = FIRST_SCREENS[name]
+    assert first.startswith("usage: rsjax ")
+    assert f"Example:  {screen.example}" in first and screen.example.startswith(f"rsjax {name}")
+    assert f"Output:   {screen.output}" in first
+    assert len(screen.used) <= 5
+    for option in screen.used:
+        assert f"--{option} " in first or f"--{option}," in first or f"--{option}\n" in first, option
+
+
+def test_the_end_says_how_long_it_took_and_what_is_next(capsys: pytest.CaptureFixture[str]) -> None:
+    @main_errors()
+    def judge() -> None:
+        parse_options(["runs/mine"], "rsjax judge", "", Options())
+        print("the result")
+
+    judge()
+    out, err = capsys.readouterr()
+    assert out == "the result\n"
+    assert err.startswith("done in 0 s; next: ") and "rsjax improve runs/mine" in err and err.count("\n") == 1
+
+
+def test_a_command_that_fails_or_was_not_called_so_says_nothing_of_what_is_next(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    @main_errors()
+    def fails() -> None:
+        parse_options(["runs/mine"], "rsjax judge", "", Options())
+        raise UserError("no clips")
+
+    @main_errors()
+    def other() -> None:
+        print("the result")
+
+    with pytest.raises(SystemExit):
+        fails()
+    other()
+    assert capsys.readouterr().err == "error: no clips\n"
