@@ -16,7 +16,7 @@ import posixpath
 import re
 import sys
 from pathlib import Path
-from typing import Any, get_args, get_type_hints
+from typing import Any, get_args
 from unittest.mock import patch
 
 from mkdocs.structure.files import File, InclusionLevel
@@ -282,7 +282,7 @@ def _sections() -> dict[type, set[str]]:
                 found.setdefault(type(value), set()).add(section)
                 visit(value, f"{section}.")
             elif value is None:  # a section that is off
-                for kind in get_args(get_type_hints(type(part))[field.name]):
+                for kind in get_args(field.type):
                     if dataclasses.is_dataclass(kind):
                         found.setdefault(kind, set()).add(section)  # type: ignore[arg-type]
 

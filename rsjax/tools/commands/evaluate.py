@@ -4,7 +4,7 @@ import dataclasses
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_type_hints
+from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
@@ -19,7 +19,9 @@ CHANGES = (
 )
 _IN_PROTOCOL = ("clips", "repetitions", "action_draws")
 _SETTINGS: list[Any] = [
-    (name, hint | None, None) for name, hint in get_type_hints(EvalConfig).items() if name not in _IN_PROTOCOL
+    (each.name, each.type | None, None)  # type: ignore[operator]  # a type, not its name
+    for each in dataclasses.fields(EvalConfig)
+    if each.name not in _IN_PROTOCOL
 ]
 Settings = dataclasses.make_dataclass("Settings", _SETTINGS, frozen=True)  # fields of EvalConfig; None: the run's
 Settings.__doc__ = "Settings of the metrics, as of rsjax train; default: the run's."
