@@ -93,6 +93,22 @@ def play_serves_the_page_and_a_frame_is_driven() -> None:
             server.terminate()
 
 
+@step
+def serve_answers_a_client() -> None:
+    from rsjax.tools.serve.client import WorldClient
+
+    line = ["rsjax", "serve", "tiny", "--port", "0"]
+    with subprocess.Popen(line, stdout=subprocess.PIPE, text=True) as server:
+        try:
+            assert server.stdout is not None
+            address = next(text.split()[0] for text in server.stdout if text.startswith("ws://"))
+            with WorldClient(address) as client:
+                client.reset(clip=0)
+                assert client.step(client.metadata["action_low"])["frame"] == 1
+        finally:
+            server.terminate()
+
+
 def answer(socket: object, number: int, kind: str) -> dict:
     """Returns the final answer to a message, which must be of this type; pictures come before it."""
     pictures = 0
