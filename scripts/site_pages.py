@@ -45,6 +45,7 @@ API = {
     ),
     "Readers of data sets": ("rsjax.tools.ingest.episode",),
 }
+SHIM = "https://unpkg.com/iframe-worker/shim"
 NO_FIELDS = ("__init__", "config_fields", "fields", "presets", "metaworld")  # modules of rsjax.config
 CODE = {".py": "python", ".sh": "bash", ".cfg": "ini", ".yaml": "yaml", ".yml": "yaml", ".json": "json", ".j2": "html"}
 
@@ -133,6 +134,11 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
 def on_page_content(html: str, page: Any, config: Any, files: Any) -> str:
     """Makes links of the roles in docstrings, such as ``:class:`Store```."""
     return ROLE.sub(_reference, html)
+
+
+def on_post_page(output: str, page: Any, config: Any) -> str:
+    """Takes what the search needs in pages opened from the disk from the site itself, not from another site."""
+    return output.replace(SHIM, posixpath.relpath("assets/iframe-worker.js", posixpath.dirname(page.url) or "."))
 
 
 def linked(name: str) -> list[str]:
