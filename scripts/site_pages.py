@@ -183,11 +183,11 @@ def command_page(name: str) -> str:
 
 
 def help_of(name: str, words: list[str]) -> str:
-    """Returns what a command prints for these arguments."""
+    """Returns what a command prints for these arguments; it does not restart the process, as commands do to tune it."""
     out = io.StringIO()
     with (
         patch.object(sys, "argv", [f"rsjax {name}", *words]),
-        patch.dict(os.environ, {"COLUMNS": "100", "NO_COLOR": "1"}),
+        patch.dict(os.environ, {"COLUMNS": "100", "NO_COLOR": "1", "GLIBC_TUNABLES": "glibc.malloc.hugetlb=1"}),
         contextlib.redirect_stdout(out),
         contextlib.suppress(SystemExit),
     ):
