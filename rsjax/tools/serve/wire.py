@@ -66,8 +66,8 @@ def pack_array(value: Any) -> Any:
 def unpack_array(value: dict[Any, Any]) -> Any:
     """Returns the array or the scalar that a map stands for, or the map itself; msgpack calls it for every map."""
     if b"__ndarray__" in value:
-        data = value.get(b"data")
-        shape = value.get(b"shape")
+        data: Any = value.get(b"data")
+        shape: Any = value.get(b"shape")
         axes_fit = isinstance(shape, list | tuple) and len(shape) <= MOST_AXES
         if not axes_fit or not all(type(side) is int and 0 <= side < 2**31 for side in shape):
             raise WireError(f"an array has the shape {shape!r:.60}; it is a list of at most {MOST_AXES} whole numbers")
