@@ -1,4 +1,4 @@
-"""Serves a world model to other programs over a WebSocket. ``rsjax serve runs/tiny``"""
+"""Serves a world model to other programs over a WebSocket. ``rsjax serve tiny``"""
 
 import os
 import sys
