@@ -10,7 +10,7 @@ from tyro.conf import Positional, arg
 
 from rsjax.config import ConfigError
 from rsjax.tools.commands.cli import main_errors, parse_options
-from rsjax.tools.export.lerobot import LeRobotOptions, export_lerobot
+from rsjax.tools.export.lerobot import LeRobotOptions, export_lerobot, openpi_advice
 
 PROG = "rsjax export"
 
@@ -42,3 +42,6 @@ def main() -> None:
         info = export_lerobot(store, options.out, options, lambda done, total: progress.update(done))
     counts = ", ".join(f"{info[f'total_{name}']} {name}" for name in ("episodes", "frames", "tasks"))
     print(f"{options.out.absolute()}: LeRobotDataset {options.version}, {counts}, {info['fps']:g} fps")
+    advice = openpi_advice(round(info["total_frames"] / info["total_episodes"]))
+    if options.version == "v2.1" and advice:
+        print(advice)

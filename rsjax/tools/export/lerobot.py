@@ -30,12 +30,15 @@ from rsjax.tools.export.lerobot_files import (
     describe_features,
     video_rate,
 )
+from rsjax.tools.ingest.formats.lerobot import EXPORTED
 
 LAYOUTS: dict[str, type[LayoutV30 | LayoutV21]] = {"v3.0": LayoutV30, "v2.1": LayoutV21}
 PROVENANCE = "provenance.json"  # beside info.json, where LeRobot reads no other file: which episodes a model generated
 CONTROLS = ("delta_x", "delta_y", "delta_z", "delta_roll", "delta_pitch", "delta_yaw", "gripper")  # of simulated Lift
 # Names of a constant state's numbers; from one number LeRobot would make (B, T), but its policies want (B, T, D).
 ZEROS = ("zero_0", "zero_1")
+OPENPI_HORIZON = 50  # action_horizon of Pi0Config
+MOST_PADDING = 0.25  # share of action targets that is acceptable
 
 
 @dataclass(frozen=True)
@@ -101,6 +104,27 @@ def export_lerobot(
     return info
 
 
+def padding(frames: int, horizon: int) -> float:
+    """Returns the share of action targets after an episode's end, if each frame asks for ``horizon`` actions.
+
+    openpi pads them by repeating the last action, and its loss counts them like the others.
+    """
+    inside = sum(min(horizon, frames - start) for start in range(frames))
+    return 1 - inside / (frames * horizon)
+
+
+def openpi_advice(frames: int) -> str:
+    """Returns which action horizon fits episodes of so many frames; "" if openpi's default does."""
+    if padding(frames, OPENPI_HORIZON) <= MOST_PADDING:
+        return ""
+    fitting = next(horizon for horizon in range(OPENPI_HORIZON, 0, -1) if padding(frames, horizon) <= MOST_PADDING)
+    return (
+        f"episodes have {frames} frames: with openpi's default action_horizon of {OPENPI_HORIZON}, "
+        f"{padding(frames, OPENPI_HORIZON):.0%} of the action targets are padding, which its loss counts; set "
+        f"action_horizon={fitting} ({padding(frames, fitting):.0%}) in its model's configuration"
+    )
+
+
 def _write(store: Store, root: Path, options: LeRobotOptions, report: Callable[[int, int], None]) -> dict[str, Any]:
     if options.split == "all":
         names = store.splits
@@ -144,6 +168,7 @@ def _write(store: Store, root: Path, options: LeRobotOptions, report: Callable[[
         write_json(root / "meta" / PROVENANCE, mark)
     if len(cameras) > 1:
         note(f"{store.path}: has clips of the cameras {', '.join(cameras)}; all are in {layout.camera}")
+    write_json(root / "meta" / EXPORTED, {"store": str(store.manifest.get("key")), "split": options.split})
     return layout.finish({"codebase_version": options.version, "robot_type": options.robot, "splits": splits})
 
 

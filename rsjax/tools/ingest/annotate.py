@@ -83,11 +83,14 @@ def _is_network(annotator: object) -> bool:
 
 
 def camera_of(episode: Episode, name: str) -> str:
-    """Returns the camera of this name, or the episode's first for "".
+    """Returns the camera of this name, or the episode's first for ""; LeRobot's full key of a column is a name too.
 
     Raises:
         EpisodeError: the episode has no such camera.
     """
+    short = name.removeprefix("observation.images.")
+    if short in episode.cameras:
+        return short
     if name and name not in episode.cameras:
         known = ", ".join(episode.cameras)
         raise EpisodeError(f"cameras: episode {episode.id} has no {name!r}; it has {known}", option="--camera")
@@ -95,7 +98,11 @@ def camera_of(episode: Episode, name: str) -> str:
 
 
 def _shots(detect: ShotDetector, camera: str, episode: Episode, inputs: Inputs) -> Records:
-    spans = detect(episode.cameras[camera_of(episode, camera)])
+    frames = episode.cameras[camera_of(episode, camera)]
+    if episode.meta.get("one_shot"):  # a clip of this project, which detection could only cut wrongly
+        spans = [(0, len(frames))]
+    else:
+        spans = detect(frames)
     yield {"spans": np.array(spans, np.int64).reshape(-1, 2)}
     return {"shots": len(spans)}
 

@@ -235,6 +235,8 @@ def _words(
     times = episode.timestamps[frames]
     if not np.allclose(np.diff(times), np.diff(frames) / episode.fps, atol=_UNEVEN):
         provenance["times"] = times.tolist()  # seconds; other clips' times follow from frames and fps
+    if "reward" in episode.meta:
+        provenance["reward"] = [episode.meta["reward"][frame] for frame in frames.tolist()]
     if annotated.motion is not None:
         provenance["motion"] = float(np.mean(annotated.motion[frames[0] + 1 : frames[-1] + 1]))
     return {"task": task or UNKNOWN, "provenance": provenance}

@@ -1,6 +1,7 @@
 """A store exported as a LeRobotDataset, read back by our own reader of that format and by pandas."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from rsjax.data.merge import merge
 from rsjax.data.store import Store
 from rsjax.errors import UserError
 from rsjax.tools.export import lerobot_files
-from rsjax.tools.export.lerobot import PROVENANCE, LeRobotOptions, export_lerobot
+from rsjax.tools.export.lerobot import PROVENANCE, LeRobotOptions, export_lerobot, openpi_advice, padding
 from rsjax.tools.ingest.ingest import ingest
 from rsjax.tools.ingest.options import IngestOptions, make_plan
 from rsjax.tools.ingest.windows import WindowConfig
@@ -101,6 +102,36 @@ def test_ingested_again_the_clips_are_the_same(tmp_path: Path, version: Any) -> 
         np.testing.assert_array_equal(new["actions"], old["actions"])
         assert_near(new["rgb"], old["rgb"])
         assert new["task"] == old["task"]
+
+
+@pytest.mark.parametrize("version", ["v3.0", "v2.1"])
+def test_a_clip_of_an_export_is_one_shot_however_it_changes(tmp_path: Path, version: Any) -> None:
+    def clips() -> Any:
+        for number in range(3):
+            rgb = np.full((20, 32, 32, 3), 20, np.uint8)
+            rgb[10:] = (230, 40, 40)  # as a cut would look
+            yield {"rgb": rgb, "actions": np.full((20, 2), number, np.float32), "task": "pick", "fps": 5.0}
+
+    store = rsjax.write_store(tmp_path / "store", clips(), test_share=0.0)
+    export_lerobot(store, tmp_path / "out", LeRobotOptions(version, crf=1))
+    off = dict.fromkeys(("motion", "depth", "tracks", "semantics"), "none")
+    windows = WindowConfig(frames=20, rate=0, hop=20)
+    own = IngestOptions(out=tmp_path / "own", windows=windows, image_size=32, test_share=0.0, **off)  # type: ignore[arg-type]
+    ingest(make_plan("lerobot", tmp_path / "out", replace(own, camera="observation.images.image")))
+    assert sum(rsjax.open_store(tmp_path / "own").counts().values()) == 3
+    (tmp_path / "out" / "meta" / "rsjax.json").unlink()  # another program's: the cut counts
+    with pytest.raises(UserError):
+        ingest(make_plan("lerobot", tmp_path / "out", replace(own, out=tmp_path / "cut")))
+
+
+def test_openpis_horizon_is_measured_by_the_actions_that_there_are() -> None:
+    for frames, horizon in ((16, 50), (16, 8), (5, 7), (60, 50)):
+        targets = [start + step < frames for start in range(frames) for step in range(horizon)]
+        assert padding(frames, horizon) == pytest.approx(1 - np.mean(targets))
+    advice = openpi_advice(16)
+    assert "83%" in advice and "action_horizon=9 (25%)" in advice
+    assert openpi_advice(200) == ""
+    assert "action_horizon=1 (0%)" in openpi_advice(1)
 
 
 def test_large_data_sets_fill_several_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -50,6 +50,8 @@ from rsjax.tools.ingest.pictures import decode_pictures
 from rsjax.tools.ingest.video import at_times
 
 TOLERANCE = 1e-4  # seconds, LeRobot's own tolerance
+EXPORTED = "rsjax.json"  # in meta, of a data set that experiments.export wrote
+OUTCOME = ("next.reward", "next.success", "next.done")
 _PLACES = ("chunk_index", "file_index")
 _BEGINS = "from_timestamp"
 _ALL = [("episode_index", ">=", 0)]  # a shared file may have more rows than the limit for one episode
@@ -81,13 +83,14 @@ def open_source(
     if action not in info.features:
         raise SourceError(f"{path}: has no column {action!r}; choose among {', '.join(info.features)}")
     tasks = _tasks(path / "meta", info.shared)
+    exported = exists(path / "meta" / EXPORTED)
     names = str(info.features[action].get("names")).lower()
     if held is None:
         stay = None
     else:
         stay = tuple(held)
     declared = Declared(kind or (None if "delta" in names else "absolute"), stay, tuple(quaternions))
-    return LeRobot(path, info, tasks, declared, action, state)
+    return LeRobot(path, info, tasks, declared, action, state, exported)
 
 
 @dataclass(frozen=True)
@@ -156,7 +159,14 @@ class LeRobot:
     name = "lerobot"
 
     def __init__(
-        self, root: Path, info: Info, tasks: dict[int, str], declared: Declared, action: str, state: str
+        self,
+        root: Path,
+        info: Info,
+        tasks: dict[int, str],
+        declared: Declared,
+        action: str,
+        state: str,
+        exported: bool = False,
     ) -> None:
         self._root = root
         self._info = info
@@ -164,6 +174,7 @@ class LeRobot:
         self._declared = declared
         self._action = action
         self._state = state
+        self._exported = exported  # by this project, which writes clips: each is one shot
 
     def episodes(self) -> Iterator[EpisodeRef]:
         """Lists ``meta/episodes``; a bad or repeated entry becomes a reference that cannot be read."""
@@ -193,7 +204,8 @@ class LeRobot:
     def read(self, ref: EpisodeRef) -> Episode:
         """Reads one episode; its pictures are not decoded, but their times are checked."""
         location = location_of(ref)
-        names = ("timestamp", "frame_index", "episode_index", "index", "task_index", self._action, self._state)
+        counters = ("timestamp", "frame_index", "episode_index", "index", "task_index")
+        names = (*counters, self._action, self._state, *OUTCOME)
         path, table = read_rows(self._root, self._info.data_path, location, names)
         times = seconds(table, "timestamp", path)
         notes = self._check_rows(table, times, location, path)
@@ -206,6 +218,12 @@ class LeRobot:
         layout = layout_of(align_actions(actions), *self._declared, dimensions, states)
         check_layout(layout, actions.shape[1], path)
         tasks = self._task_of_rows(table, path)
+        meta: dict[str, Any] = {"actions": layout.to_json(), "action_names": dimensions}
+        meta |= _outcome(table, path, notes)
+        if self._exported:
+            meta["one_shot"] = True
+        if notes:
+            meta["notes"] = notes
         episode = Episode(
             id=ref.id,
             fingerprint=ref.fingerprint,
@@ -216,7 +234,7 @@ class LeRobot:
             states=states,
             cameras=self._cameras(location, times, path),
             segments=tuple(runs(tasks)) if len(set(tasks)) > 1 else (),
-            meta={"actions": layout.to_json(), "action_names": dimensions} | ({"notes": notes} if notes else {}),
+            meta=meta,
         )
         return checked(episode, path)
 
@@ -280,7 +298,7 @@ class LeRobot:
             problem = f"{count} rows of episode {number}, metadata say {location['length']}"
             raise EpisodeError.at(path, problem, kind="length")
         expected = {"episode_index": np.full(count, number), "frame_index": np.arange(count)}
-        notes = {}
+        notes: dict[str, str] = {}
         if "rows" in location:
             first = int(integers(table, "index", path)[0])
             expected["index"] = np.arange(first, first + count)
@@ -315,6 +333,40 @@ class LeRobot:
         for key in self._info.of_type("image"):
             cameras[_camera(key)] = TablePictures(path, key, location)
         return cameras
+
+
+def _outcome(table: pa.Table, path: Path, notes: dict[str, str]) -> dict[str, Any]:
+    """Returns what the columns ``next.…`` say of each frame: ``success`` and ``reward``, if they are there.
+
+    Row t says what its action led to, so it counts for frame t + 1. The last row speaks of a frame that was not
+    recorded; if that is a success, so is the last frame. Without ``next.success``, rewards that are all 0 or 1 say it.
+
+    Args:
+        notes: gets an entry if the episode goes on after ``next.done``.
+    """
+    columns = {name: _numbers(table, name, path)[:, 0] for name in OUTCOME if name in table.column_names}
+    made: dict[str, Any] = {}
+    reward = columns.get("next.reward")
+    success = columns.get("next.success")
+    if reward is not None:
+        made["reward"] = [0.0, *reward[:-1].tolist()]
+        if success is None and np.isin(reward, (0, 1)).all():
+            success = reward
+    if success is not None:
+        after = np.append(False, success[:-1] > 0)
+        after[-1] |= success[-1] > 0
+        made["success"] = after.tolist()
+    done = np.flatnonzero(columns.get("next.done", np.zeros(1)) > 0)
+    if done.size and done[0] < len(table) - 1:
+        notes["done"] = f"next.done at row {done[0]}, after which {len(table) - 1 - done[0]} rows follow"
+    return made
+
+
+def _numbers(table: pa.Table, column: str, path: Path) -> Float[np.ndarray, "N 1"]:
+    values = matrix(table, column, path)
+    if values.shape[1] != 1 or not np.isfinite(values).all():
+        raise EpisodeError.at(path, f"column {column!r} is not one finite number a row")
+    return values
 
 
 def _tasks(meta: Path, shared: bool) -> dict[int, str]:

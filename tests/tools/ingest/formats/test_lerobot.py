@@ -224,3 +224,24 @@ def test_deltas_are_declared_and_not_guessed(tmp_path: Path) -> None:
         "held": [1],
         "quaternions": [],
     }
+
+
+def test_success_reward_and_the_end_are_those_of_the_frame_that_an_action_led_to(tmp_path: Path) -> None:
+    def written(name: str, **columns: list[Any]) -> Any:
+        root = write_v2(tmp_path / name)
+        (table,) = (root / "data").glob("*/episode_000000.parquet")
+        pq.write_table(pa.table(rows(0, 0) | {f"next.{column}": pa.array(x) for column, x in columns.items()}), table)
+        return read_all("lerobot", root)[0].meta
+
+    plain = written("plain")
+    assert "success" not in plain and "reward" not in plain
+    said = written("all", success=[False, False, True, False, False, True], reward=[0.5, 1, 2, 3, 4, 5])
+    assert said["success"] == [False, False, False, True, False, True]
+    assert said["reward"] == [0, 0.5, 1, 2, 3, 4]
+    assert written("sparse", reward=[0.0, 0, 0, 0, 0, 1])["success"] == [False] * 5 + [True]
+    assert "success" not in written("dense", reward=[0.1, 0.2, 0.3, 0.4, 0.5, 1])
+    ended = written("done", done=[False, False, False, True, False, False])
+    assert ended["notes"]["done"] == "next.done at row 3, after which 2 rows follow"
+    with pytest.raises(EpisodeError) as raised:
+        written("nan", reward=[0.1, float("nan"), 0.3, 0.4, 0.5, 1])
+    assert "next.reward" in str(raised.value)
