@@ -10,6 +10,7 @@ import numpy as np
 from markupsafe import Markup
 
 from rsjax.evaluation.coverage import UNSEEN
+from rsjax.evaluation.metrics.failures import FLAGGED
 from rsjax.evaluation.registry import Metric, metrics
 from rsjax.evaluation.results import Curves
 from rsjax.evaluation.statistics import bootstrap
@@ -21,7 +22,7 @@ from rsjax.tools.studies.report.player import player_clip, player_script, player
 from rsjax.tools.studies.report.score_charts import PLACE_SCENES, SCENES, frame_curves_svg, place_errors_svg, probes_svg
 from rsjax.tools.studies.report.targets import judge
 from rsjax.tools.studies.report.video import webp_uri
-from rsjax.tools.studies.tables import CellText, Footnotes, Marked, Table, as_html
+from rsjax.tools.studies.tables import ABSENT, CellText, Footnotes, Marked, Table, as_html
 
 _FPS = 4  # the rate at which the player starts; one of its rates
 
@@ -126,6 +127,7 @@ def write_report(path: Path, report: RunReport) -> None:
         probes=Markup(probes_svg(report.curves, drives)),
         frame_curves=Markup(frame_curves_svg(report.curves, [*scored, *further, *states])),
         notes=notes.texts,
+        failures=_failures(report),
         targets=_targets(report) if report.show_targets else None,
         training={name: Markup(curves_svg(log, name)) for name, log in report.logs.items() if log},
         settings=_settings(report.config),
@@ -203,6 +205,17 @@ def _coverage(report: RunReport) -> Markup | None:
         rows.append([span, str(len(rows_of)), str(unseen), Marked(f"{score.value:.2f}", remark=remark)])
     header = ("distance, in the median training clip's", "clips", "not seen in training", "PSNR, dB ↑")
     return as_html(Table(header, rows))
+
+
+def _failures(report: RunReport) -> Markup | None:
+    """Returns the table of how many clips show a failure mode, by kind of video; None without scores."""
+    rows: list[list[CellText]] = []
+    for name, bound in FLAGGED.items():
+        scored = [report.per_clip.get(f"{name}{suffix}", ()) for suffix in SCENES]
+        counts = [f"{sum(x > bound for x in values)} of {len(values)}" if values else ABSENT for values in scored]
+        if any(scored):
+            rows.append([f"{metrics()[name].title}, share above {bound:g}", *counts])
+    return as_html(Table(["clips with", *SCENES.values()], rows)) if rows else None
 
 
 def _targets(report: RunReport) -> Markup | None:

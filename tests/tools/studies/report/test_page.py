@@ -83,7 +83,12 @@ def full_page(tmp_path_factory, make_clip):
         metrics=_METRICS,
         clips=[make_clip(title=f"episode <{i}>") for i in range(3)],
         curves=_CURVES,
-        per_clip={"cube_error_widths": [0.3, 0.0, 2.0], "cube_error_widths_truth": [0.1, 0.1, 0.1]},
+        per_clip={
+            "ghost": [0.1, 0.3, 0.9],
+            "ghost_tokenizer": [0.1, 0.3, 0.0],
+            "cube_error_widths": [0.3, 0.0, 2.0],
+            "cube_error_widths_truth": [0.1, 0.1, 0.1],
+        },
         logs={"tokenizer": _LOG, "world model": _LOG},
         config={"name": "tiny", "train": {"learning_rate": 0.0001}},
         versions={"jax": "0.10.2"},
@@ -122,6 +127,8 @@ def test_tables_show_each_number_in_its_row(full_page):
     assert ["true frames (the reading network's own error)", "0.084", "–", "–"] in page.cells
     assert ["ΔPSNR, another clip's actions", "≥ 7 dB", "6.75 dB", "missed by 0.25"] in page.cells
     assert ["cube's place in the last frame, median error", "≤ 0.3 widths", "0.25 widths", "met"] in page.cells
+    assert ["ghosts, share above 0.25", "2 of 3", "–", "1 of 3"] in page.cells
+    assert not any(cells[0].startswith("morphing") for cells in page.cells if cells)
     assert ["train", "1 h 02 min"] in page.cells
     assert ["collect", "1 min 15 s"] in page.cells
     assert ["learning_rate", "0.0001"] in page.cells
