@@ -28,6 +28,7 @@ from rsjax.tools.policies.studies.trials import Trials, open_lift
 from rsjax.tools.policies.worlds.actions import action_range
 from rsjax.tools.studies.paper.budget import FAMILY_EPISODES
 from rsjax.tools.studies.paper.claim import Arm, Claim, Comparison, register
+from rsjax.tools.studies.paper.claims.baselines import RATES
 from rsjax.tools.studies.paper.measurements import FOLDER, Scores, measurement
 
 STRONG = 0.9  # correlation with success in the simulator that counts as strong
@@ -191,11 +192,11 @@ def planned(run: Run) -> Scores:
     return {way: [float(row["success"]) for row in episodes if row["way"] == way] for way in ways}
 
 
-_OURS = Arm("RoboScape")
+_OURS = Arm("RoboScape", rate=RATES["RoboScape"])  # each arm has its family's best learning rate, as in Table 1
 _OTHERS = (  # the paper compares with the last two; CogVideoX has no actions
-    Arm("Genie", model="genie", equal="seconds"),
-    Arm("iVideoGPT", preset="ivideogpt", equal="seconds"),
-    Arm("IRASim", preset="irasim", equal="seconds"),
+    Arm("Genie", model="genie", equal="seconds", rate=RATES["Genie"]),
+    Arm("iVideoGPT", preset="ivideogpt", equal="seconds", rate=RATES["iVideoGPT"]),
+    Arm("IRASim", preset="irasim", equal="seconds", rate=RATES["IRASim"]),
 )
 _NOTE = "Lift and Diffusion Policy, with less training than the paper's; success is the simulator's own predicate."
 
