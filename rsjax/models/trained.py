@@ -1,6 +1,6 @@
 """The public interface of a trained world model: numpy arrays in, numpy arrays out."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -99,7 +99,10 @@ class TrainedModel:
         """
         codec = self._codec()
         grid = self.config.grid
-        arrays = {name: np.asarray(x) for name, x in tokens.items()}
+        codes = 2**self.config.tokenizer.code_bits
+        if not isinstance(tokens, Mapping):
+            raise ShapeError(f"tokens are {type(tokens).__name__}; expected a dict with rgb, or rgb and depth")
+        arrays = {name: _array(f"tokens {name!r}", x) for name, x in tokens.items()}
         if not {"rgb"} <= arrays.keys() <= {"rgb", "depth"}:
             raise ShapeError(f"tokens are of {', '.join(arrays) or 'nothing'}; expected rgb, or rgb and depth")
         for name, x in arrays.items():
@@ -107,6 +110,10 @@ class TrainedModel:
                 raise ShapeError(
                     f"tokens {name!r} have shape {x.shape} and type {x.dtype}; expected (T, {grid}, {grid}) for one "
                     f"clip or (B, T, {grid}, {grid}) for several, integers"
+                )
+            if not x.size or not 0 <= x.min() <= x.max() < codes:
+                raise ShapeError(
+                    f"tokens {name!r} are {_extent(x)}; expected one frame at least, from 0 to {codes - 1}"
                 )
             if x.shape != arrays["rgb"].shape:
                 raise ShapeError(f"tokens {name!r} have shape {x.shape}; expected {arrays['rgb'].shape}, that of 'rgb'")
@@ -147,7 +154,7 @@ class TrainedModel:
 
     def _actions(self, actions: Any, prompt: Video, lead: tuple[int | str, ...]) -> Float32[np.ndarray, "*B T A"]:
         """Checks and returns actions as float32; ``lead`` are the sizes of axes before T, "N" for any above 0."""
-        actions = np.asarray(actions)
+        actions = _array("actions", actions)
         width = self.config.clips.action_dim
         past = prompt.rgb.shape[1]
         expected = ", ".join(map(str, (*lead, "T", width)))
@@ -163,24 +170,32 @@ class TrainedModel:
         prompt, single = self._video(frames, depth)
         if task is None:
             return prompt, single
-        tasks = np.array([task] * len(prompt) if isinstance(task, str) else list(task))
-        if tasks.shape != (len(prompt),):
-            raise ShapeError(f"task has {len(tasks)} texts; expected one, or {len(prompt)}, one for each clip")
-        return replace(prompt, tasks=tasks), single
+        if isinstance(task, str):
+            task = [task] * len(prompt)
+        if not isinstance(task, Sequence) or not all(isinstance(each, str) for each in task):
+            raise ShapeError(f"task is {task!r:.80}; expected one text, or {len(prompt)}, one for each clip")
+        if len(task) != len(prompt):
+            raise ShapeError(f"task has {len(task)} texts; expected one, or {len(prompt)}, one for each clip")
+        return replace(prompt, tasks=np.array(task)), single
 
     def _video(self, frames: Any, depth: Any) -> tuple[Video, bool]:
         """Checks and returns the arguments with a leading axis over clips, and whether that axis was added."""
-        frames = np.asarray(frames)
+        frames = _array("frames", frames)
         size = self.config.clips.image_size
-        if frames.ndim not in (4, 5) or frames.shape[-3:] != (size, size, 3) or frames.dtype != np.uint8:
+        if (
+            not frames.size
+            or frames.ndim not in (4, 5)
+            or frames.shape[-3:] != (size, size, 3)
+            or frames.dtype != np.uint8
+        ):
             raise ShapeError(
                 f"frames have shape {frames.shape} and type {frames.dtype}; expected (P, {size}, {size}, 3) for one "
-                f"clip or (B, P, {size}, {size}, 3) for several, uint8"
+                f"clip or (B, P, {size}, {size}, 3) for several, uint8, with P and B above 0"
             )
         single = frames.ndim == 4
         if depth is None:
             return Video(frames[None] if single else frames), single
-        depth = np.asarray(depth)
+        depth = _array("depth", depth)
         if depth.shape != frames.shape[:-1] or depth.dtype.kind not in "fiu":
             raise ShapeError(
                 f"depth has shape {depth.shape} and type {depth.dtype}; expected {frames.shape[:-1]}, that of the "
@@ -188,6 +203,19 @@ class TrainedModel:
             )
         depth = depth.astype(np.float32)
         return (Video(frames[None], depth[None]) if single else Video(frames, depth)), single
+
+
+def _array(name: str, value: Any) -> np.ndarray:
+    try:
+        return np.asarray(value)
+    except (ValueError, TypeError) as error:  # lists of other lengths, or what has no length
+        raise ShapeError(f"{name} cannot be made an array ({error}); expected numbers of one shape") from error
+
+
+def _extent(x: np.ndarray) -> str:
+    if not x.size:
+        return f"empty, of shape {x.shape}"
+    return f"from {x.min()} to {x.max()}"
 
 
 def _first(video: Video) -> Video:

@@ -212,6 +212,18 @@ WRONG: dict[str, tuple[Callable[[TrainedModel], Any], str]] = {
     "decode-floats": (lambda m: m.decode({"rgb": TOKENS / 2}), "type float64; .*integers"),
     "decode-lengths": (lambda m: m.decode({"rgb": TOKENS, "depth": TOKENS[0]}), "'depth' have shape .*'rgb'"),
     "decode-no-rgb": (lambda m: m.decode({"depth": TOKENS}), "tokens are of depth; expected rgb"),
+    "frames-none": (lambda m: m.generate(None, ACTIONS), FRAMES_EXPECTED),
+    "frames-no-clip": (lambda m: m.generate(RGB[:0, :1], ACTIONS[:0]), FRAMES_EXPECTED),
+    "frames-no-frame": (lambda m: m.generate(RGB[:, :0], ACTIONS), FRAMES_EXPECTED),
+    "frames-ragged": (lambda m: m.generate([[1], [1, 2]], ACTIONS), "frames cannot be made an array"),
+    "actions-ragged": (lambda m: m.generate(RGB[0, :1], [[1], [1, 2]]), "actions cannot be made an array"),
+    "actions-none": (lambda m: m.generate(RGB[0, :1], None), "actions have shape"),
+    "task-number": (lambda m: m.generate(RGB[0, :1], ACTIONS[0], task=7), "task is 7; expected one text"),
+    "task-numbers": (lambda m: m.generate(RGB[:, :1], ACTIONS, task=[1, 2]), "task is .1, 2.; expected one text"),
+    "decode-none": (lambda m: m.decode(None), "tokens are NoneType"),
+    "decode-nothing": (lambda m: m.decode({"rgb": TOKENS[:, :0]}), "tokens 'rgb' are empty"),
+    "decode-codes": (lambda m: m.decode({"rgb": TOKENS + 2**30}), "tokens 'rgb' are from 1073741824 to 1073741824"),
+    "decode-below": (lambda m: m.decode({"rgb": TOKENS - 1}), "tokens 'rgb' are from -1 to -1"),
     "decode-names": (lambda m: m.decode({"rgb": TOKENS, "deep": TOKENS}), "tokens are of rgb, deep; expected rgb"),
 }
 

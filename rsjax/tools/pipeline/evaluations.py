@@ -14,6 +14,7 @@ import rsjax
 from rsjax.config import Config, EvalConfig, content_key, to_dict
 from rsjax.data.clips import frame_rate
 from rsjax.data.store import Store, open_store
+from rsjax.errors import UserError
 from rsjax.evaluation import evaluate as evaluation
 from rsjax.evaluation.coverage import make_coverage
 from rsjax.evaluation.evaluate import EvaluationClips
@@ -26,6 +27,7 @@ from rsjax.models.trained import TrainedModel
 from rsjax.progress import note
 from rsjax.tools.pipeline.depth_stage import check_depth, depth_estimator
 from rsjax.tools.pipeline.evaluation_clips import chosen_splits, evaluation_store, probes_of, with_second_takes
+from rsjax.tools.pipeline.limits import GIB, host_memory
 from rsjax.tools.pipeline.metric_files import by_content, check_metric_files
 from rsjax.tools.pipeline.provenance import code_version, data_fingerprint, machine, training_settings
 from rsjax.tools.pipeline.run import RECIPE, Run
@@ -35,6 +37,7 @@ from rsjax.tools.sim import probes, retakes
 from rsjax.training.distributed import barrier, is_lead, on_lead
 
 FOLDER = "evaluations"
+MOST_FRAMES = 1_000_000  # of all clips of an evaluation
 NOT_OF_METRICS = ("clips", "repetitions", "action_draws", "batch_size")
 
 
@@ -82,6 +85,7 @@ def evaluate_run(directory: Path, data: Path, request: Request) -> Iterator[Path
     check_metric_files(config.eval)
     standard = find(request.protocol, config)
     protocol = replace(standard, **request.changes, splits=request.splits or standard.splits)
+    check_request(config, protocol)
     trained = _sampling(replace(load(directory), config=config), protocol)
     run = Run(config, directory, data)
     store = run.open_clips()
@@ -105,6 +109,31 @@ def evaluate_run(directory: Path, data: Path, request: Request) -> Iterator[Path
         folder = directory / FOLDER / name
         evaluate_into(folder, name, trained, run, store, chosen, request.overwrite)
         yield folder
+
+
+def check_request(config: Config, protocol: Protocol) -> None:
+    """Checks, before anything is loaded or simulated, that an evaluation can be made.
+
+    Raises:
+        UserError: the depth scores in tables need an estimator, and there is none; or the clips would not fit into
+            memory, or take days to simulate.
+    """
+    if protocol.depth_source == "estimator" and not config.eval.depth_estimator:
+        raise UserError(
+            "--depth-source estimator needs a network that estimates depth: set --eval.depth-estimator "
+            "(docs/evaluation.md), or --depth-source branch"
+        )
+    frames = protocol.prompt_frames + protocol.horizon
+    what = f"protocol {protocol.name}: {protocol.clips} clips of {frames} frames"
+    cure = "lower --prompt-frames, --horizon or --clips"
+    if protocol.clips * frames > MOST_FRAMES:
+        raise UserError(f"{what} are more than {MOST_FRAMES:,}, which take days to simulate and generate; {cure}")
+    needed = protocol.clips * frames * config.clips.image_size**2 * (3 + 4 * config.model.uses_depth)
+    there = host_memory()
+    if needed > there:
+        raise UserError(
+            f"{what} take {needed / GIB:,.0f} GiB; this machine has {there / GIB:,.0f} GiB of memory; {cure}"
+        )
 
 
 def evaluate_own(run: Run) -> Evaluation:

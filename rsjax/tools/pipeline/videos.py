@@ -199,6 +199,12 @@ def resampled(trained: TrainedModel, sample: dict[str, Any]) -> TrainedModel:
     if unknown := sample.keys() - known:
         names = f"{', '.join(sorted(unknown))}; it has {', '.join(known)}"
         raise UserError(f"a model of family {trained.config.model.family!r} has no setting {names}")
+    cells = trained.config.grid**2
+    if "unmask" in known and sample.get("steps", 1) > cells:
+        raise UserError(
+            f"steps is {sample['steps']}, but a frame has {cells} cells, of which each step decodes one at least; take "
+            f"at most as many"
+        )
     model = dataclasses.replace(trained.config.model, sample=dataclasses.replace(settings, **sample))  # type: ignore[call-arg]
     config = dataclasses.replace(trained.config, model=model)
     return dataclasses.replace(trained, config=config, model=create_model(config))

@@ -142,6 +142,14 @@ def test_options_without_a_preset() -> None:
         parse_options([], "generate", "", NeedsRun(tyro.MISSING))
 
 
+def test_an_empty_path_is_refused() -> None:
+    """As of a variable of the shell that is not set: Path("") would be the working directory."""
+    assert parse_options(["."], "generate", "", NeedsRun(tyro.MISSING)).run_dir == Path()
+    with pytest.raises(ConfigError) as raised:
+        parse_options([""], "generate", "", NeedsRun(tyro.MISSING))
+    assert "an empty path" in str(raised.value)
+
+
 def test_only_options_that_add_up_may_be_repeated() -> None:
     @dataclasses.dataclass(frozen=True)
     class Adds:

@@ -295,6 +295,10 @@ def test_a_comparison_of_a_run_with_itself(
         (Request("paper", CHANGES, splits=("unseen",)), "no split 'unseen'; it has train, test: choose with --split"),
         (Request("unseen", CHANGES), r"no split 'unseen\*'; it has train, test"),
         (Request("paper", CHANGES, data=Path("nowhere")), "nowhere: not there"),
+        (Request("paper", CHANGES | {"depth_source": "estimator"}), "estimator needs a network .* --eval.depth-estim"),
+        (Request("paper", CHANGES | {"prompt_frames": 10**9}), "clips of 1000000005 frames are more than 1,000,00"),
+        (Request("paper", CHANGES | {"steps": 999_999}), r"steps is 999999, but a frame has \d+ cells"),
+        (Request("paper", CHANGES | {"resolution": 1}), "resolution is 1; frames have at least 16 pixels"),
         (Request("paper", CHANGES, {"weights": "nowhere"}), "eval.weights is nowhere: no such directory"),
     ],
 )

@@ -6,7 +6,8 @@ one another, heavy noise, heavy blur. The validation also judges spoilt held-out
 Axes: B videos, F frames of a history, H×W pixels.
 """
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -24,7 +25,7 @@ from rsjax.config import content_key
 from rsjax.data.codec import decode, encode
 from rsjax.errors import UserError
 from rsjax.evaluation.results import fingerprint
-from rsjax.files import read_json, write_file
+from rsjax.files import read_json, regular, write_file
 from rsjax.layers.group_norm import GroupNorm
 from rsjax.progress import Progress
 from rsjax.tools.policies.judges.judge import (
@@ -40,6 +41,8 @@ from rsjax.tools.policies.judges.judge import (
 
 FILE = "judge.msgpack"
 VALIDATION = "validation.json"
+VALIDATED = ("raw", "reconstructed", "generated")  # kinds of videos in a validation
+MOST_SIDE = 4096
 SIDE = 64  # pixels; frames with a longer side are downsampled for the network
 BATCH = 64  # histories in a training step, of which a quarter are spoilt
 SPOILT = BATCH // 4
@@ -113,13 +116,14 @@ def load_judge(folder: Path, side: int | None = None) -> TrainedJudge:
     path = folder / FILE
     report = folder / VALIDATION
     try:
-        record = decode(path.read_bytes())
+        record = decode(regular(path).read_bytes())
         temperature = float(record.pop("temperature"))
         trained_on = int(record.pop("side"))
         in_a_row = int(record.pop("in_a_row", 1))
+        _check_judge(record, temperature, trained_on, in_a_row)
     except FileNotFoundError as error:
         raise UserError(f"{path}: no judge there; train one with rsjax judge RUN") from error
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, KeyError, TypeError, OverflowError) as error:
         raise UserError(f"{path}: damaged ({error}); train it again with rsjax judge RUN") from error
     if side not in (None, trained_on):
         raise UserError(
@@ -128,14 +132,46 @@ def load_judge(folder: Path, side: int | None = None) -> TrainedJudge:
         )
     params = unflatten_dict({tuple(name.split("/")): x for name, x in record.items()})
     judge = TrainedJudge(params, temperature, trained_on, in_a_row=in_a_row)
+    found = None
     if report.exists():
         found = read_json(report, cure="train the judge again")
-    else:
-        found = None
+        _check_validation(report, found)
     # An interrupted training may have left the validation of an earlier judge. Older validations do not name the judge.
     if found and found.get("judge", judge.key) == judge.key:
         return replace(judge, validation=found)
     return judge
+
+
+def _check_judge(record: Mapping[str, Any], temperature: float, side: int, in_a_row: int) -> None:
+    """Raises ValueError unless a judge can have these parameters and numbers."""
+    if not 0 < temperature < math.inf:
+        raise ValueError(f"its temperature is {temperature}, not a number above 0")
+    if not 0 < side <= MOST_SIDE:
+        raise ValueError(f"its side is {side}, not from 1 to {MOST_SIDE}")
+    if not 0 < in_a_row <= MOST_SIDE:
+        raise ValueError(f"its in_a_row is {in_a_row}, not from 1 to {MOST_SIDE}")
+    frames = jax.ShapeDtypeStruct((1, HISTORY, side, side, 3), np.uint8)
+    params = jax.eval_shape(Network().init, jax.random.key(0), frames)["params"]
+    wanted = {"/".join(path): x.shape for path, x in flatten_dict(params).items()}
+    found = {name: np.shape(x) for name, x in record.items()}
+    if found != wanted:
+        names = sorted(name for name in found.keys() | wanted.keys() if found.get(name) != wanted.get(name))
+        raise ValueError(f"{names[0]} is {found.get(names[0], 'missing')}, not {wanted.get(names[0], 'there')}")
+
+
+def _check_validation(path: Path, validation: dict[str, Any]) -> None:
+    """Raises :class:`UserError` unless the parts of a validation have what results show of them."""
+    count = len(LABELS)
+    for kind in VALIDATED:
+        part = validation.get(kind, {"confusion": [[0] * count] * count, "right": [0.0], "calibration_error": 0.0})
+        try:
+            confusion = np.asarray(part["confusion"], float)
+            shares = [rate[0] for rates in part.get("whole_clips", {}).values() for rate in rates.values()]
+            numbers = np.asarray([part["right"][0], part["calibration_error"], *shares], float)
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise UserError(f"{path}: its part {kind!r} is damaged ({error}); train the judge again") from error
+        if confusion.shape != (count, count) or not np.isfinite(confusion).all() or not np.isfinite(numbers).all():
+            raise UserError(f"{path}: its part {kind!r} has no {count} × {count} counts; train the judge again")
 
 
 @dataclass(frozen=True)

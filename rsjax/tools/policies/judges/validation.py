@@ -22,10 +22,10 @@ from rsjax.tools.policies.judges.judge import (
     frames_of,
     of_single_frames,
 )
-from rsjax.tools.policies.judges.trained_judge import Footage, spoilt
+from rsjax.tools.policies.judges.trained_judge import VALIDATED, Footage, spoilt
 from rsjax.tools.studies.tables import ABSENT, Table, as_markdown
 
-KINDS = ("raw", "reconstructed", "generated")
+KINDS = VALIDATED
 OUTCOMES = ("false_success", "false_failure", "right")
 BINS = 10
 AT_ONCE = 1024  # histories judged at once

@@ -3,8 +3,9 @@
 Axes: S×S pixels, A action dimensions.
 """
 
+import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -12,21 +13,23 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 from gymnasium.vector.utils import batch_space
-from jaxtyping import UInt8
+from jaxtyping import Bool, UInt8
 
 from rsjax.config import SimConfig
+from rsjax.data.normalization import Normalization
 from rsjax.data.state_labels import STATE
-from rsjax.errors import UserError
+from rsjax.errors import UserError, did_you_mean
+from rsjax.files import checked_path
 from rsjax.model_directory import locate
 from rsjax.models.base import Imagination
-from rsjax.models.load_run import load
+from rsjax.models.load_run import load, load_config
 from rsjax.models.trained import TrainedModel
 from rsjax.tools.policies.judges.head_judge import NAME as HEAD
 from rsjax.tools.policies.judges.head_judge import HeadJudge, head_judge
 from rsjax.tools.policies.judges.judge import LABELS, Judge
 from rsjax.tools.policies.judges.judge_training import judge_of
 from rsjax.tools.policies.run_data import RunData
-from rsjax.tools.policies.worlds.actions import OutOfRange, check_out_of_range, check_takes_actions
+from rsjax.tools.policies.worlds.actions import OutOfRange, action_range, check_out_of_range, check_takes_actions
 from rsjax.tools.policies.worlds.model_world import FirstFrame, ModelWorld
 from rsjax.tools.policies.worlds.simulator_world import SimulatorWorld
 from rsjax.tools.policies.worlds.starts import Starts
@@ -34,6 +37,9 @@ from rsjax.tools.policies.worlds.world import Observation, WorldState
 from rsjax.tools.sim.expert import State
 
 FAR = 10.0  # metres; nothing that the simulator's cameras see is farther
+MOST_STEPS = 10**6  # of an episode
+MOST_ENVIRONMENTS = 2**16
+MOST_SEEDS = 2**32
 STEPS = 30  # default length of an episode: 6 s at 5 frames per second
 DEFAULT = SimConfig(camera="near")
 
@@ -61,9 +67,53 @@ class EnvironmentSettings:
     out_of_range: OutOfRange = "clip"
 
     def __post_init__(self) -> None:
-        if self.max_steps < 1:
-            raise UserError(f"max_steps is {self.max_steps}; an episode has at least 1 step")
+        checked_count("max_steps", self.max_steps, MOST_STEPS)
         check_out_of_range(self.out_of_range)
+        checked_path(self.data_dir, "data_dir")
+        if self.store is not None:
+            checked_path(self.store, "store")
+        if not isinstance(self.split, str):
+            raise UserError(f"split is {self.split!r:.80}; give the name of a split, such as test")
+        if self.judge is not None and not isinstance(self.judge, str | Path) and not callable(self.judge):
+            raise UserError(f"judge is {self.judge!r:.80}; give a judge, the directory of one, 'run', 'head' or None")
+
+    @classmethod
+    def read(cls, values: dict[str, Any]) -> "EnvironmentSettings":
+        """Returns the settings of these names and values.
+
+        Raises:
+            UserError: there is no such setting, or its value is not allowed.
+        """
+        known = [field.name for field in fields(cls)]
+        for name in values:
+            if name not in known:
+                hint = did_you_mean(name, known)
+                raise UserError(f"an environment has no setting {name}{hint} (settings: {', '.join(known)})")
+        return cls(**values)
+
+
+def checked_count(name: str, count: object, most: int) -> int:
+    """Returns a whole number from 1 to ``most``.
+
+    Raises:
+        UserError: it is none.
+    """
+    if isinstance(count, bool) or not isinstance(count, int | np.integer) or not 1 <= count <= most:
+        raise UserError(f"{name} is {count!r:.80}; it is a whole number from 1 to {most}")
+    return int(count)
+
+
+def checked_seed(seed: object) -> int | None:
+    """Returns the seed of one environment.
+
+    Raises:
+        UserError: it is neither None nor a whole number from 0 to 2³² - 1.
+    """
+    if seed is None:
+        return None
+    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or not 0 <= seed < MOST_SEEDS:
+        raise UserError(f"seed is {seed!r:.80}; it is a whole number from 0 to {MOST_SEEDS - 1}")
+    return int(seed)
 
 
 class _Model:
@@ -77,38 +127,75 @@ class _Model:
         imagination: Imagination | None = None,
     ) -> None:
         if isinstance(run, TrainedModel):
-            trained = run
+            config = run.config
+            normalization = run.assets.normalization
             folder = Path(".")
             name = "the model"
         elif isinstance(run, RunData):
-            trained = run.trained
+            config = run.trained.config
+            normalization = run.trained.assets.normalization
             folder = run.run
             name = f"{folder}: the model"
         else:
-            trained = load(run)
-            folder = locate(run)
+            folder = locate(checked_path(run, "run"))
+            config = load_config(folder)
+            normalization = Normalization.load(folder / "tokens")
             name = f"{run}: the model"
-        config = trained.config
         check_takes_actions(config.model, name)
         size = config.clips.image_size
-        depth_range = trained.assets.normalization.depth_range
+        depth_range = normalization.depth_range
         has_depth = config.model.uses_depth and depth_range is not None
         if settings.store:
             store = Path(settings.store)
         else:
             store = None
-        judge: Judge | HeadJudge | None
-        if settings.judge == HEAD:
-            judge = head_judge(trained, folder)
-        else:
-            judge = judge_of(run if isinstance(run, TrainedModel) else folder, settings.judge, size)
-        self.world = ModelWorld(trained, count, judge, whole_videos=False, imagination=imagination)
         self.starts = Starts(config, folder, Path(settings.data_dir), store, settings.split, has_depth)
-        self.action_space = spaces.Box(self.world.actions.low, self.world.actions.high)
+        actions = action_range(config, normalization)
+        self.action_space = spaces.Box(actions.low, actions.high)
         observation: dict[str, spaces.Space[Any]] = {"rgb": spaces.Box(0, 255, (size, size, 3), np.uint8)}
         if has_depth:
             observation["depth"] = spaces.Box(0.0, max(FAR, depth_range[1]), (size, size))  # type: ignore[index]
         self.observation_space = spaces.Dict(observation)
+        self._world: ModelWorld | None = None
+        if not _forked:  # neither JAX nor TensorStore works in a forked process; the first reset says so
+            if isinstance(run, RunData):
+                trained = run.trained
+            elif isinstance(run, TrainedModel):
+                trained = run
+            else:
+                trained = load(run)
+            judge: Judge | HeadJudge | None
+            if settings.judge == HEAD:
+                judge = head_judge(trained, folder)
+            else:
+                judge = judge_of(run if isinstance(run, TrainedModel) else folder, settings.judge, size)
+            self._world = ModelWorld(trained, count, judge, whole_videos=False, imagination=imagination)
+
+    @property
+    def world(self) -> ModelWorld:
+        """The world.
+
+        Raises:
+            UserError: this process was forked from one that had the environment.
+        """
+        if self._world is None:
+            raise UserError(
+                "a world model cannot run in a forked process: start processes anew, with "
+                'gymnasium.make_vec(…, vectorization_mode="async", vector_kwargs={"context": "spawn"}), or leave out '
+                "vectorization_mode: then one program steps all environments"
+            )
+        return self._world
+
+
+_forked = False
+
+
+def _note_fork() -> None:
+    global _forked
+    _forked = True
+
+
+os.register_at_fork(after_in_child=_note_fork)
 
 
 def _info(state: WorldState, clipped: np.ndarray, clip: np.ndarray) -> dict[str, np.ndarray]:
@@ -160,9 +247,9 @@ class WorldModelEnv(gymnasium.Env[Any, Any]):
         imagination: Imagination | None = None,
         **settings: Any,
     ) -> None:
-        self._settings = EnvironmentSettings(**settings)
+        self._settings = EnvironmentSettings.read(settings)
         model = _Model(run, 1, self._settings, imagination)
-        self._world = model.world
+        self._model = model
         self._starts = model.starts
         self._frame: np.ndarray | None = None
         self._clipped = 0
@@ -184,12 +271,12 @@ class WorldModelEnv(gymnasium.Env[Any, Any]):
         Raises:
             StartError: the given frame does not fit, or the run's clips are missing.
         """
-        super().reset(seed=seed)
-        start = self._starts.choose(self.np_random, options or {})
+        super().reset(seed=checked_seed(seed))
+        start = self._starts.choose(self.np_random, {} if options is None else options)
         self._clip = start.clip
         self._clipped = 0
         self._steps = 0
-        return self._seen(self._world.reset([start]))
+        return self._seen(self._model.world.reset([start]))
 
     def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Generates the next frame.
@@ -206,8 +293,8 @@ class WorldModelEnv(gymnasium.Env[Any, Any]):
         """
         if self._frame is None:
             raise gymnasium.error.ResetNeeded("reset the environment before its first step")
-        row, outside = self._world.actions.clip(action, None, self._settings.out_of_range)
-        state = self._world.step(row[None])
+        row, outside = self._model.world.actions.clip(action, None, self._settings.out_of_range)
+        state = self._model.world.step(row[None])
         self._clipped += int(outside.sum())
         self._steps += 1
         observation, info = self._seen(state)
@@ -246,9 +333,10 @@ class WorldModelVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
     metadata = {"autoreset_mode": gymnasium.vector.AutoresetMode.NEXT_STEP}  # noqa: RUF012 - Gymnasium's own type
 
     def __init__(self, run: Path | str | TrainedModel, num_envs: int = 1, **settings: Any) -> None:
-        self._settings = EnvironmentSettings(**settings)
+        num_envs = checked_count("num_envs", num_envs, MOST_ENVIRONMENTS)
+        self._settings = EnvironmentSettings.read(settings)
         model = _Model(run, num_envs, self._settings)
-        self._world = model.world
+        self._model = model
         self._starts = model.starts
         self.num_envs = num_envs
         self.single_action_space = model.action_space
@@ -275,7 +363,7 @@ class WorldModelVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         if seed is not None or not self._rng:
             self._rng = [np.random.default_rng(each) for each in _seeds(seed, self.num_envs)]
         everything = np.ones(self.num_envs, bool)
-        state = self._world.reset(self._begin(everything, options or {}))
+        state = self._model.world.reset(self._begin(everything, {} if options is None else options))
         self._over[:] = False
         return state.observation, _masked(_info(state, self._clipped, self._clip))
 
@@ -292,17 +380,23 @@ class WorldModelVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         if not self._rng:
             raise gymnasium.error.ResetNeeded("reset the environments before their first step")
         again = self._over
-        rows, outside = self._world.actions.clip(actions, self.num_envs, self._settings.out_of_range, again)
-        state = self._world.step(rows, ignored=again)
+        rows, outside = self._model.world.actions.clip(actions, self.num_envs, self._settings.out_of_range, again)
+        state = self._model.world.step(rows, ignored=again)
         self._clipped += outside.sum(1)
         self._steps += 1
         if again.any():
-            state = self._world.reset(self._begin(again, {}), which=again)
+            state = self._model.world.reset(self._begin(again, {}), which=again)
         success = state.success & ~again
         truncated = self._steps >= self._settings.max_steps
         self._over = success | truncated
         info = _info(state, self._clipped, self._clip) | {"action": rows}
         return state.observation, success.astype(np.float64), success, truncated, _masked(info)
+
+    def restart(self, which: Bool[np.ndarray, " B"]) -> Observation:
+        """Begins new episodes in these environments now, and returns the observations of all."""
+        state = self._model.world.reset(self._begin(which, {}), which=which)
+        self._over[which] = False
+        return state.observation
 
     def _begin(self, which: np.ndarray, options: dict[str, Any]) -> list[FirstFrame]:
         """Chooses first frames for these environments, and sets their counts back."""
@@ -317,9 +411,11 @@ def _seeds(seed: int | Sequence[int | None] | None, count: int) -> list[int | No
     """Returns the seed of each environment."""
     if seed is None:
         return [None] * count
-    if np.isscalar(seed):
-        return [int(seed) + number for number in range(count)]  # type: ignore[arg-type]
-    seeds = list(seed)  # type: ignore[arg-type]
+    if not isinstance(seed, Sequence | np.ndarray) or isinstance(seed, str):
+        first = checked_seed(seed)
+        assert first is not None
+        return [first + number for number in range(count)]
+    seeds = [checked_seed(each) for each in seed]
     if len(seeds) != count:
         raise UserError(f"{len(seeds)} seeds for {count} environments; give one number, or one for each environment")
     return seeds
@@ -356,6 +452,7 @@ class LiftEnv(gymnasium.Env[Any, Any]):
         out_of_range: OutOfRange = "clip",
         render_mode: str | None = None,
     ) -> None:
+        checked_count("max_steps", max_steps, MOST_STEPS)
         check_out_of_range(out_of_range)
         self._world = SimulatorWorld.lift(config, 1)
         self._max_steps = max_steps
@@ -388,6 +485,7 @@ class LiftEnv(gymnasium.Env[Any, Any]):
 
         If there is no seed, one is drawn from the generator that the last seed started.
         """
+        seed = checked_seed(seed)
         super().reset(seed=seed)
         if seed is None:
             start = int(self.np_random.integers(2**32))

@@ -13,12 +13,13 @@ from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from rsjax.clip import Video
 from rsjax.config import content_key
+from rsjax.errors import UserError
 from rsjax.evaluation.coverage import Coverage, clip_distances
 from rsjax.evaluation.results import fingerprint
 from rsjax.models.base import Imagination, WorldModel
 from rsjax.models.trained import TrainedModel
 from rsjax.tools.policies.judges.head_judge import HeadJudge
-from rsjax.tools.policies.judges.judge import SUCCESS, Judge, frames_of, judge_key
+from rsjax.tools.policies.judges.judge import LABELS, SUCCESS, Judge, frames_of, judge_key
 from rsjax.tools.policies.worlds.actions import ActionRange, action_range
 from rsjax.tools.policies.worlds.world import Episode, WorldState
 
@@ -161,11 +162,29 @@ class ModelWorld:
             assert self._read is not None
             verdict = self._judge.read(self._read)[running]
         elif self._judge is not None:
-            verdict = self._judge(self._recent)[running]
+            verdict = checked_verdict(self._judge(self._recent), self.count)[running]
         if verdict is not None:
             success = verdict.argmax(-1) == SUCCESS
         observation = {name: frames[running] for name, frames in self._observation.items()}
         return WorldState(observation, success, actions[running], clipped[running], verdict, read)
+
+
+def checked_verdict(verdict: object, count: int) -> Float[np.ndarray, "B 3"]:
+    """Returns a judge's answer about ``count`` videos.
+
+    Raises:
+        UserError: it is not the probabilities of the labels.
+    """
+    try:
+        numbers = np.asarray(verdict, float)
+    except (TypeError, ValueError):
+        numbers = np.zeros(0)
+    if numbers.shape != (count, len(LABELS)) or not np.isfinite(numbers).all():
+        raise UserError(
+            f"the judge returned {type(verdict).__name__} of shape {np.shape(numbers)}; it returns finite "
+            f"probabilities of {', '.join(LABELS)} for each video, of shape {(count, len(LABELS))}"
+        )
+    return numbers
 
 
 def _last_frame(video: Video) -> dict[str, np.ndarray]:

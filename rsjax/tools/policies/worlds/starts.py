@@ -3,6 +3,7 @@
 Axes: S×S pixels.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -17,6 +18,8 @@ from rsjax.errors import UserError
 from rsjax.tools.pipeline.run import Run
 from rsjax.tools.pipeline.run_clips import relocated
 from rsjax.tools.policies.worlds.model_world import FirstFrame
+
+MOST_DRAWS = 2**31
 
 
 class StartError(UserError):
@@ -78,8 +81,14 @@ class Starts:
         Raises:
             StartError: the frame has another size or type, there is no such clip, or the clips are missing.
         """
+        if not isinstance(options, Mapping):
+            raise StartError(f"options are {options!r:.80}; give a dict with some of rgb, depth, clip and draw")
         if unknown := options.keys() - {"rgb", "depth", "clip", "draw"}:
-            raise StartError(f"reset has no option {', '.join(sorted(unknown))} (options: rgb, depth, clip, draw)")
+            names = ", ".join(sorted(map(str, unknown)))
+            raise StartError(f"reset has no option {names:.80} (options: rgb, depth, clip, draw)")
+        draw = options.get("draw", 0)
+        if not isinstance(draw, int | np.integer) or not 0 <= draw < MOST_DRAWS:
+            raise StartError(f"the option draw is {draw!r:.80}; it is a whole number from 0 to {MOST_DRAWS - 1}")
         number = -1
         if "rgb" in options or "depth" in options:
             rgb, depth = self._checked(options)
@@ -90,7 +99,7 @@ class Starts:
                 depth = clip["depth"][0]
             else:
                 depth = None
-        drawn = rng.integers(2**31)  # also where the options say otherwise, so that later choices are the same
+        drawn = rng.integers(MOST_DRAWS)  # also where the options say otherwise, so that later choices are the same
         return FirstFrame(rgb, depth, int(options.get("draw", drawn)), number)
 
     def _clip(self, rng: np.random.Generator, number: Any) -> tuple[int, dict[str, Any]]:
@@ -102,7 +111,7 @@ class Starts:
                     return chosen, clip
             raise StartError(f"no clip of the {self.split} split has depth, which this model starts from")
         if not isinstance(number, int | np.integer) or not 0 <= number < count:
-            raise StartError(f"no clip {number!r} in the {self.split} split, which has 0 … {count - 1}")
+            raise StartError(f"no clip {number!r:.80} in the {self.split} split, which has 0 … {count - 1}")
         clip = self.source[int(number)]
         if self.depth and clip["depth"] is None:
             raise StartError(f"clip {number} of the {self.split} split has no depth, which this model starts from")
@@ -111,7 +120,7 @@ class Starts:
     def _checked(self, options: dict[str, Any]) -> tuple[np.ndarray, np.ndarray | None]:
         """Returns the caller's frame and its depth."""
         size = self.config.clips.image_size
-        rgb = np.asarray(options.get("rgb"))
+        rgb = _array(options.get("rgb"))
         if rgb.shape != (size, size, 3) or rgb.dtype != np.uint8:
             raise StartError(
                 f"the first frame's rgb has shape {rgb.shape} and type {rgb.dtype}; expected ({size}, {size}, 3), "
@@ -119,10 +128,18 @@ class Starts:
             )
         if not self.depth:
             return rgb, None
-        depth = np.asarray(options.get("depth"))
+        depth = _array(options.get("depth"))
         if depth.shape != (size, size) or depth.dtype.kind not in "fiu" or not np.isfinite(depth).all():
             raise StartError(
                 f"the first frame's depth has shape {depth.shape} and type {depth.dtype}; this model generates depth, "
                 f"so it starts from finite floats of shape ({size}, {size}), metres along the optical axis"
             )
         return rgb, depth.astype(np.float32)
+
+
+def _array(value: Any) -> np.ndarray:
+    """Returns an array; an empty one for lists of other lengths, which the caller refuses by its shape."""
+    try:
+        return np.asarray(value)
+    except ValueError:
+        return np.zeros(0)

@@ -1,4 +1,5 @@
 import json
+import os
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 from rsjax.clip import Video
+from rsjax.data.codec import decode, encode
 from rsjax.errors import UserError
 from rsjax.tools.policies.judges import judge_training as judging
 from rsjax.tools.policies.judges import trained_judge as judge_module
@@ -73,6 +75,39 @@ def test_a_judge_comes_back_from_its_file_and_damage_is_named(judge: TrainedJudg
     one = footage(4, 0)
     with pytest.raises(UserError, match="both success and failure"):
         train_judge(Footage(one.rgb, np.zeros_like(one.success)), one, 1)
+
+
+def test_a_judge_of_impossible_content_is_refused(judge: TrainedJudge, tmp_path: Path) -> None:
+    folder = tmp_path / "judge"
+    judge.save(folder)
+    path = folder / "judge.msgpack"
+    whole = decode(path.read_bytes())
+    some = next(name for name, x in whole.items() if isinstance(x, np.ndarray))
+    others: tuple[dict[str, Any], ...] = (
+        *({"temperature": value} for value in (None, 0.0, -1.0, float("nan"), "warm", [1.0])),
+        *({"side": value} for value in (0, -4, 10**9, None)),
+        {some: np.zeros((2, 2), np.float32)},
+        {"more": np.zeros(1, np.float32)},
+        {name: None for name in whole if name not in ("temperature", "side")},
+    )
+    for changes in others:
+        path.write_bytes(encode({name: x for name, x in (whole | changes).items() if x is not None}))
+        with pytest.raises(UserError) as raised:
+            load_judge(folder)
+        assert "damaged" in str(raised.value), changes
+    path.unlink()
+    os.mkfifo(path)
+    with pytest.raises(UserError):
+        load_judge(folder)
+    path.unlink()
+    judge.save(folder)
+    good = {"confusion": [[1, 0, 0], [0, 1, 0], [0, 0, 0]], "right": [1.0, 0.5, 1.0], "calibration_error": 0.1}
+    for part in (None, 7, good | {"confusion": [[1]]}, good | {"right": None}, good | {"calibration_error": "x"}):
+        (folder / "validation.json").write_text(json.dumps({"judge": judge.key, "raw": part}))
+        with pytest.raises(UserError):
+            load_judge(folder)
+    (folder / "validation.json").write_text(json.dumps({"judge": judge.key, "raw": good}))
+    assert load_judge(folder).validation is not None
 
 
 def test_histories_end_with_their_frame() -> None:

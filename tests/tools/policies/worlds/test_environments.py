@@ -1,7 +1,9 @@
 """The world model as an environment: the frames of ``generate``, Gymnasium's rules, and errors that name shapes."""
 
+import sys
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import gymnasium
@@ -18,6 +20,7 @@ from rsjax.tools.pipeline.run import Run
 from rsjax.tools.policies.judges.judge import HISTORY, LABELS, SUCCESS
 from rsjax.tools.policies.worlds.actions import ActionError
 from rsjax.tools.policies.worlds.environments import WorldModelEnv, WorldModelVectorEnv
+from rsjax.tools.policies.worlds.stable_baselines import vec_env
 from rsjax.tools.policies.worlds.starts import StartError
 from tests.models.toy_family import ToyConfig
 from tests.tools.pipeline import toy
@@ -159,6 +162,122 @@ def test_bad_actions_and_frames_are_named(env: WorldModelEnv, model: TrainedMode
         WorldModelEnv(model, out_of_range="refused")
     with pytest.raises(StartError, match='reset needs a first frame of its own: options={"rgb": …, "depth": …}'):
         WorldModelEnv(model, data_dir=tmp_path).reset()
+
+
+JUNK: tuple[Any, ...] = (-1, 1.5, "x", 10**400, True, [], {})
+
+
+def test_junk_is_refused_at_one_border(env: WorldModelEnv, model: TrainedModel, clips: Store) -> None:
+    where: dict[str, Any] = {"data_dir": clips.path.parent}
+    settings: dict[str, tuple[Any, ...]] = {
+        "max_steps": (0, *JUNK),
+        "data_dir": (None, 7, "", "x" * 5000, "a\0b"),
+        "split": (None, 7),
+        "judge": (7, [1]),
+        "out_of_range": ("ignore", None),
+        "max_step": (9,),
+    }
+    for name, values in settings.items():
+        for value in values:
+            with pytest.raises(UserError) as raised:
+                WorldModelEnv(model, **(where | {name: value}))
+            assert name in str(raised.value)
+    for count in (0, *JUNK):
+        with pytest.raises(UserError, match="num_envs is"):
+            WorldModelVectorEnv(model, count, **where)
+    several = WorldModelVectorEnv(model, 2, **where)
+    for wrong in JUNK:
+        for each in (env, several):
+            if each is env or wrong != []:
+                with pytest.raises(UserError):
+                    each.reset(seed=wrong)
+    with pytest.raises(UserError, match="3 seeds for 2"):
+        several.reset(seed=[1, 2, 3])
+    options: tuple[Any, ...] = (7, "x", [1], {7: 1}, {"rgb": [[1], [1, 2]]})
+    for option in (*options, *({"draw": wrong} for wrong in JUNK if wrong is not True)):
+        for each in (env, several):
+            with pytest.raises(StartError):
+                each.reset(seed=0, options=option)
+
+
+@pytest.mark.filterwarnings("ignore:os.fork")
+def test_forked_processes_are_refused_in_one_line(env: WorldModelEnv, model: TrainedModel, clips: Store) -> None:
+    many = gymnasium.vector.AsyncVectorEnv(
+        [lambda: WorldModelEnv(model, data_dir=clips.path.parent)] * 2, shared_memory=False
+    )
+    try:
+        assert many.single_observation_space == env.observation_space
+        with pytest.raises(UserError) as raised:
+            many.reset(seed=0)
+        assert '"context": "spawn"' in str(raised.value) and "\n" not in str(raised.value)
+    finally:
+        many.close(terminate=True)
+
+
+class PlainVecEnv:
+    """What stable-baselines3's VecEnv does for its subclasses, as far as this project's relies on it."""
+
+    def __init__(self, num_envs: int, observation_space: Any, action_space: Any) -> None:
+        self.num_envs = num_envs
+        self.observation_space = observation_space
+        self.action_space = action_space
+        self._reset_seeds()
+        self._reset_options()
+
+    def _reset_seeds(self) -> None:
+        self._seeds: list[int | None] = [None] * self.num_envs
+
+    def _reset_options(self) -> None:
+        self._options: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+
+    def seed(self, seed: int) -> None:
+        self._seeds = [seed + number for number in range(self.num_envs)]
+
+    def step(self, actions: np.ndarray) -> Any:
+        self.step_async(actions)  # type: ignore[attr-defined]
+        return self.step_wait()  # type: ignore[attr-defined]
+
+
+def test_a_vec_env_restarts_in_the_step_that_ends_an_episode(
+    model: TrainedModel, clips: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With a stand-in for stable-baselines3's base class, which need not be installed."""
+    settings: dict[str, Any] = {"max_steps": 2, "data_dir": clips.path.parent}
+    for name in ("stable_baselines3", "stable_baselines3.common", "stable_baselines3.common.vec_env"):
+        monkeypatch.setitem(sys.modules, name, ModuleType(name))
+    sys.modules["stable_baselines3.common.vec_env"].VecEnv = PlainVecEnv  # type: ignore[attr-defined]
+    many = vec_env(model, 2, **settings)
+    alone = WorldModelVectorEnv(model, 2, **settings)
+    many.seed(5)
+    seen, (expected, begun) = many.reset(), alone.reset(seed=[5, 6])
+    np.testing.assert_array_equal(seen["rgb"], expected["rgb"])
+    assert [info["clip"] for info in many.reset_infos] == begun["clip"].tolist()
+    rows = actions(10, 28).reshape(5, 2, 28)
+    many.step(rows[0])
+    alone.step(rows[0])
+    seen, reward, over, infos = many.step(rows[1])
+    last = alone.step(rows[1])[0]
+    first = alone.step(rows[2])[0]  # ignored actions: the episodes begin here
+    assert over.all() and reward.dtype == np.float32
+    for number, info in enumerate(infos):
+        assert info["TimeLimit.truncated"] is True
+        np.testing.assert_array_equal(info["terminal_observation"]["rgb"], last["rgb"][number])
+    np.testing.assert_array_equal(seen["rgb"], first["rgb"])
+    assert not many.step(rows[3])[2].any()
+    with pytest.raises(UserError):
+        many.env_method("render")
+    monkeypatch.setitem(sys.modules, "stable_baselines3.common.vec_env", None)
+    with pytest.raises(UserError) as raised:
+        vec_env(model, 2, **settings)
+    assert "pip install stable-baselines3" in str(raised.value)
+
+
+def test_an_answer_that_is_no_judges_is_refused(model: TrainedModel, clips: Store) -> None:
+    for answer in (None, "yes", np.zeros((1, 2)), np.full((1, 3), np.nan), [[1], [1, 2]]):
+        judged = WorldModelEnv(model, data_dir=clips.path.parent, judge=lambda frames, answer=answer: answer)
+        with pytest.raises(UserError) as raised:
+            judged.reset(seed=0)
+        assert "the judge returned" in str(raised.value)
 
 
 def test_somebody_elses_agent_learns_in_it(env: WorldModelEnv) -> None:

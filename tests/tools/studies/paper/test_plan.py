@@ -43,6 +43,14 @@ def test_what_is_no_duration_is_refused(text: str) -> None:
         parse_duration(text)
 
 
+def test_a_budget_of_400_digits_is_refused() -> None:
+    for text in ("9" * 400 + "h", "400d"):
+        with pytest.raises(ConfigError) as raised:
+            parse_duration(text)
+        assert "longer than 366 days" in str(raised.value)
+        assert len(str(raised.value)) < 200
+
+
 @settings(max_examples=15, deadline=None)
 @given(st.floats(120, 2e5), st.floats(1, 10))
 def test_a_larger_budget_never_makes_anything_smaller_and_no_size_exceeds_the_presets(
