@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 import rsjax
 from rsjax.config import presets
 from rsjax.data.labels import Labels
-from rsjax.data.normalization import Normalization
+from rsjax.data.normalization import FILE, Normalization
 from rsjax.data.quarantine import read_quarantine
 from rsjax.data.store import open_store
 from rsjax.errors import UserError
@@ -213,7 +213,7 @@ def test_pipes_are_refused_where_content_is_hashed_or_labels_are_read(tmp_path: 
 
 
 def test_a_changed_digit_of_sealed_numbers_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "normalization.json"
+    path = tmp_path / FILE
     saved = Normalization((0.125, 2.0), (1.0, 0.5), (0.3, 2.5))
     saved.save(tmp_path)
     assert Normalization.load(tmp_path) == saved

@@ -24,7 +24,7 @@ ASIDE = 0.35  # distance from the line between both colours, relative to its len
 POINTS = 32
 PATCH = (9, 9)
 ALIKE = 0.7  # correlation of a point's surroundings from which they are the same in the true clip
-CHANGED = 0.5  # and below which they are others in the generated one
+CHANGED = 0.6  # and below which they are others in the generated one
 
 Points = Float32[np.ndarray, "K 2"]
 
@@ -85,7 +85,7 @@ def likeness(frames: UInt8[np.ndarray, "T H W 3"], points: Points) -> Float32[np
     places = points[:, None]
     kept = np.ones(len(points), bool)
     for before, after in pairwise(grey):
-        places, status, _ = cv2.calcOpticalFlowPyrLK(before, after, places, None, winSize=(11, 11), maxLevel=2)
+        places, status, _ = cv2.calcOpticalFlowPyrLK(before, after, places, places.copy(), winSize=(11, 11), maxLevel=2)
         kept &= status[:, 0] > 0
     size = np.array(grey[0].shape[::-1])
     kept &= ((places[:, 0] >= 0) & (places[:, 0] < size)).all(1)

@@ -110,7 +110,9 @@ def test_a_clip_of_an_export_is_one_shot_however_it_changes(tmp_path: Path, vers
         for number in range(3):
             rgb = np.full((20, 32, 32, 3), 20, np.uint8)
             rgb[10:] = (230, 40, 40)  # as a cut would look
-            yield {"rgb": rgb, "actions": np.full((20, 2), number, np.float32), "task": "pick", "fps": 5.0}
+            actions = np.full((20, 2), number, np.float32)
+            actions[0] = 0
+            yield {"rgb": rgb, "actions": actions, "task": "pick", "fps": 5.0}
 
     store = rsjax.write_store(tmp_path / "store", clips(), test_share=0.0)
     export_lerobot(store, tmp_path / "out", LeRobotOptions(version, crf=1))

@@ -272,11 +272,12 @@ class WorldModelEnv(gymnasium.Env[Any, Any]):
             StartError: the given frame does not fit, or the run's clips are missing.
         """
         super().reset(seed=checked_seed(seed))
+        world = self._model.world  # before clips are read, which kills a forked process
         start = self._starts.choose(self.np_random, {} if options is None else options)
         self._clip = start.clip
         self._clipped = 0
         self._steps = 0
-        return self._seen(self._model.world.reset([start]))
+        return self._seen(world.reset([start]))
 
     def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Generates the next frame.

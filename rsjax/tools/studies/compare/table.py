@@ -10,7 +10,13 @@ from rsjax.errors import did_you_mean
 from rsjax.evaluation.registry import Metric
 from rsjax.tools.studies import tables
 from rsjax.tools.studies.compare.groups import Group, noted
-from rsjax.tools.studies.compare.published import SOURCE, published, published_name, published_score_of
+from rsjax.tools.studies.compare.published import (
+    SOURCE,
+    published,
+    published_name,
+    published_score_of,
+    published_text,
+)
 from rsjax.tools.studies.compare.scores import Difference, Entry, Score, columns, difference, entries_of, score_of
 from rsjax.tools.studies.tables import ABSENT, CellText, Footnotes, Marked, Table, interval_text, mean_text
 
@@ -112,7 +118,7 @@ def score_table(comparison: Comparison, notes: Footnotes) -> Table:
                 row.append(f"{mean} {interval_text(score.interval, metric.decimals)}".rstrip())
         for name in comparison.papers:
             value = published_score(comparison, metric, name)
-            row.append(Marked(ABSENT if value is None else f"{value:g}", "published"))
+            row.append(Marked(ABSENT if value is None else published_text(metric.name, value), "published"))
         rows.append(row)
     return Table(head, rows)
 

@@ -183,16 +183,18 @@ def test_junk_is_refused_at_one_border(env: WorldModelEnv, model: TrainedModel, 
                 WorldModelEnv(model, **(where | {name: value}))
             assert name in str(raised.value)
     for count in (0, *JUNK):
-        with pytest.raises(UserError, match="num_envs is"):
+        with pytest.raises(UserError) as raised:
             WorldModelVectorEnv(model, count, **where)
+        assert str(raised.value).startswith("num_envs is ")
     several = WorldModelVectorEnv(model, 2, **where)
     for wrong in JUNK:
         for each in (env, several):
             if each is env or wrong != []:
                 with pytest.raises(UserError):
                     each.reset(seed=wrong)
-    with pytest.raises(UserError, match="3 seeds for 2"):
+    with pytest.raises(UserError) as raised:
         several.reset(seed=[1, 2, 3])
+    assert "3 seeds for 2" in str(raised.value)
     options: tuple[Any, ...] = (7, "x", [1], {7: 1}, {"rgb": [[1], [1, 2]]})
     for option in (*options, *({"draw": wrong} for wrong in JUNK if wrong is not True)):
         for each in (env, several):

@@ -15,7 +15,7 @@ from rsjax.evaluation.results import Result
 from rsjax.evaluation.statistics import bootstrap, welch
 from rsjax.tools.studies.compare.groups import noted, parse_group, read_groups
 from rsjax.tools.studies.compare.page import ComparedClip, strips, write_page
-from rsjax.tools.studies.compare.published import published_name
+from rsjax.tools.studies.compare.published import LOSSY, published_name, published_text
 from rsjax.tools.studies.compare.table import as_csv, as_json, as_markdown, compare
 from tests.tools.studies.compare import toy
 
@@ -324,3 +324,9 @@ def test_rows_of_the_paper() -> None:
         assert published_name({"family": "roboscape", "settings": settings}) == row
     assert published_name({"family": "irasim"}) == "IRASim"
     assert published_name({"family": "mine"}) is None
+
+
+def test_published_physics_iq_says_what_lossy_video_does_to_it() -> None:
+    assert published_text("psnr", 21.8533) == "21.8533"
+    for name, size in LOSSY.items():
+        assert published_text(f"{name}_all_frames", 0.5) == f"0.5 (lossy video: ± {size:g})"
