@@ -47,11 +47,14 @@ def load_config(run: Path) -> Config:
 
 def load_assets(config: Config, run: Path) -> Assets:
     """Loads the data that the run's world model needs in addition to its own parameters."""
+    return Assets(load_normalization(run), load_tokenizer(config, run))
+
+
+def load_normalization(run: Path) -> Normalization:
+    """Loads the numbers that turn a run's units into its model's."""
     if is_saved(run):
-        normalization = Normalization.of(saved_section(run).get("normalization"), run / SETTINGS)
-    else:
-        normalization = Normalization.load(run / "tokens")
-    return Assets(normalization, load_tokenizer(config, run))
+        return Normalization.of(saved_section(run).get("normalization"), run / SETTINGS)
+    return Normalization.load(run / "tokens")
 
 
 def load_tokenizer(config: Config, run: Path) -> Params | None:

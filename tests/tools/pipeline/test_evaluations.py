@@ -15,6 +15,7 @@ from rsjax.data.normalization import Normalization
 from rsjax.data.store import Store
 from rsjax.errors import UserError
 from rsjax.evaluation import evaluate as evaluation
+from rsjax.evaluation.coverage import Coverage
 from rsjax.evaluation.depth_estimator import DepthEstimator
 from rsjax.evaluation.evaluate import EvaluationClips
 from rsjax.evaluation.metrics import fvd
@@ -47,12 +48,12 @@ MADE: list[Path] = []  # where batches of the evaluations that were made lie
 def scored(
     trained: TrainedModel,
     store: Store,
-    protocol: Protocol | None = None,
-    *,
+    protocol: Protocol | None,
     eval_clips: EvaluationClips,
     folder: Path,
-    estimator: DepthEstimator | None = None,
+    estimator: DepthEstimator | None,
     probes: Probes | Unavailable,
+    coverage: Coverage | None,
 ) -> Evaluation:
     """Stands for an evaluation, whose scores other tests look at: PSNR rises by 1 dB from clip to clip."""
     MADE.append(folder)
@@ -239,10 +240,11 @@ def test_second_takes_are_a_result_of_their_own(run: Run, folder: Path, monkeypa
     whole = [{"rgb": np.full((FRAMES + 2, 8, 8, 3), i, np.uint8)} for i in range(toy.TEST)]
     monkeypatch.setattr(retakes, "collect_second_takes", lambda clips, split, numbers, *_: [whole[i] for i in numbers])
 
-    def evaluate(*inputs: Any, eval_clips: EvaluationClips, **more: Any) -> Evaluation:
+    def evaluate(*inputs: Any) -> Evaluation:
+        eval_clips: EvaluationClips = inputs[3]
         assert eval_clips.retakes is not None
         takes.append(eval_clips.retakes.rgb)
-        return scored(*inputs, eval_clips=eval_clips, **more)
+        return scored(*inputs)
 
     monkeypatch.setattr(evaluation, "evaluate", evaluate)
     (with_takes,) = evaluate_run(run.directory, run.data_directory, Request("paper", CHANGES, retakes=True))

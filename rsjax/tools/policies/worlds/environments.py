@@ -16,13 +16,12 @@ from gymnasium.vector.utils import batch_space
 from jaxtyping import Bool, UInt8
 
 from rsjax.config import SimConfig
-from rsjax.data.normalization import Normalization
 from rsjax.data.state_labels import STATE
 from rsjax.errors import UserError, did_you_mean
 from rsjax.files import checked_path
 from rsjax.model_directory import locate
 from rsjax.models.base import Imagination
-from rsjax.models.load_run import load, load_config
+from rsjax.models.load_run import load, load_config, load_normalization
 from rsjax.models.trained import TrainedModel
 from rsjax.tools.policies.judges.head_judge import NAME as HEAD
 from rsjax.tools.policies.judges.head_judge import HeadJudge, head_judge
@@ -139,7 +138,7 @@ class _Model:
         else:
             folder = locate(checked_path(run, "run"))
             config = load_config(folder)
-            normalization = Normalization.load(folder / "tokens")
+            normalization = load_normalization(folder)
             name = f"{run}: the model"
         check_takes_actions(config.model, name)
         size = config.clips.image_size
