@@ -2,6 +2,7 @@
 
 import importlib
 import sys
+from configparser import ConfigParser
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from unittest.mock import patch
@@ -52,9 +53,10 @@ def test_a_word_runs_the_command_of_that_name(capsys: pytest.CaptureFixture[str]
 
 
 def test_the_script_of_an_installation_is_this_function() -> None:
-    settings = (ROOT / "setup.cfg").read_text()
-    (line,) = [line.strip() for line in settings.splitlines() if line.strip().startswith("rsjax = ")]
-    assert EntryPoint("rsjax", line.partition(" = ")[2], "console_scripts").load() is command.main
+    settings = ConfigParser()
+    settings.read(ROOT / "setup.cfg")
+    name, _, value = settings["options.entry_points"]["console_scripts"].strip().partition(" = ")
+    assert name == "rsjax" and EntryPoint(name, value, "console_scripts").load() is command.main
 
 
 def test_modules_of_experiments_call_the_commands() -> None:

@@ -27,6 +27,7 @@ def convert(*arguments: object) -> None:
 
 
 def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    capsys.readouterr()  # of commands before
     with pytest.raises(SystemExit) as stop:
         convert(*arguments)
     assert stop.value.code == 2

@@ -113,6 +113,7 @@ def test_other_mistakes_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixtu
 
 
 def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    capsys.readouterr()  # of commands before
     with pytest.raises(SystemExit) as stop:
         main(["lpips", *map(str, arguments)])
     assert stop.value.code == 2
