@@ -167,8 +167,9 @@ def test_grasps_and_drives_are_compared_with_their_curves(make: Make, tmp_path: 
     assert "lifted where the simulator fails ↓" in as_markdown(found)
     write_page(tmp_path / "page.html", found, "the command")
     page = (tmp_path / "page.html").read_text()
-    assert page.count(">share of grasps that succeed<") == 1
-    assert page.count(">PSNR of drives, dB ↑<") == 1
+    charts = page[page.index("<svg") : page.index("</svg>")]
+    assert charts.count(">share of grasps that succeed<") == 1
+    assert charts.count(">PSNR of drives, dB ↑<") == 1
 
 
 def test_strips_show_the_ends_of_all_clips_and_of_the_kept_ones(make: Make) -> None:
