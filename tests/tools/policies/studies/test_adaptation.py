@@ -1,4 +1,4 @@
-"""A whole adaptation of ``debug`` through its command: once, killed and resumed, with a second round, and refused."""
+"""A whole adaptation of ``debug`` by its command: two rounds, recorded episodes, killed and resumed, and refused."""
 
 import json
 import shutil
@@ -6,6 +6,7 @@ import signal
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -21,6 +22,7 @@ from rsjax.tools.policies.judges.trained_judge import Network, TrainedJudge
 from rsjax.tools.policies.on_policy import FIRST_EPISODE
 from rsjax.tools.policies.policy_training import train_policy
 from rsjax.tools.policies.run_data import RunData
+from rsjax.tools.policies.studies.adaptation import Adaptation, steps_of
 from rsjax.tools.policies.worlds.simulator_world import SimulatorWorld
 from rsjax.tools.sim.episode import clip_seed
 from tests.tools.pipeline.conftest import Commands, command, debug, shared
@@ -120,30 +122,44 @@ def test_a_second_round_starts_from_the_first_and_learns_from_both_rounds_episod
     assert "| round-2 " in (place.out / "results.md").read_text()
 
 
-def test_killed_and_run_again_it_gives_the_same_bytes(place: Place, command: Commands, tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    words = (place.run, "--policy", place.policy, *QUICK, "--out", out)
-    killed = command("tests.tools.policies.killed", *words)
-    assert killed.returncode == -signal.SIGKILL, killed.stderr
-    done(command, *words)
-    for file in ("on-policy-1/clips/train-00000.array_record", "on-policy-1/clips/test-00000.array_record"):
-        assert (out / file).read_bytes() == (place.out / file).read_bytes()
-    jax.tree.map(np.testing.assert_array_equal, load(out / "round-1").params, load(place.out / "round-1").params)
-    assert results(out)["models"] == results(place.out)["models"][:2]
-    line = command.refused("experiments.adapt", *words, "--share", 0.4)
-    assert "holds an adaptation of another run, to other policies or episodes, or with other settings" in line
-
-
-def test_recorded_episodes_serve_as_well(place: Place, command: Commands, tmp_path: Path) -> None:
+def test_recorded_episodes_serve_as_well_and_a_killed_call_that_runs_again_gives_the_same_bytes(
+    place: Place, command: Commands, tmp_path: Path
+) -> None:
     store = place.out / "on-policy-1" / "episodes"
-    words = ("--episodes", store, "--minutes", 0.001, "--out", tmp_path / "out")
-    assert "minutes are" in done(command, place.run, *words)
-    found = results(tmp_path / "out")
-    assert "success" not in found and found["steps"] >= 1
+    words = (place.run, "--episodes", store, "--steps", 4, "--out")
+    done(command, *words, tmp_path / "whole")
+    found = results(tmp_path / "whole")
+    assert "success" not in found
     assert found["models"][0]["on_policy"] == results(place.out)["models"][0]["on_policy"]
+
+    out = tmp_path / "out"
+    killed = command("tests.tools.policies.killed", *words, out)
+    assert killed.returncode == -signal.SIGKILL, killed.stderr
+    done(command, *words, out)
+    for file in ("on-policy-1/clips/train-00000.array_record", "on-policy-1/clips/test-00000.array_record"):
+        assert (out / file).read_bytes() == (tmp_path / "whole" / file).read_bytes()
+    params = [load(each / "round-1").params for each in (out, tmp_path / "whole")]
+    jax.tree.map(np.testing.assert_array_equal, *params)
+    assert results(out) == found
+
+
+def test_what_cannot_be_adapted_is_refused(place: Place, command: Commands) -> None:
+    episodes = ("--episodes", place.out / "on-policy-1" / "episodes")
+    other = ("--policy", place.policy, *QUICK, "--share", 0.4, "--out", place.out)
     for bad, wrong in (
         ((), "name policies with --policy DIR, recorded episodes with --episodes STORE, or both"),
-        (("--episodes", store, "--share", 1), "--share is 1.0"),
-        (("--episodes", store, "--rounds", 3), "--rounds is 3; it is 1 or 2"),
+        ((*episodes, "--share", 1), "--share is 1.0"),
+        ((*episodes, "--rounds", 3), "--rounds is 3; it is 1 or 2"),
+        (other, "holds an adaptation of another run, to other policies or episodes, or with other settings"),
     ):
         assert wrong in command.refused("experiments.adapt", place.run, *bad)
+
+
+def test_minutes_become_steps_by_the_runs_own_log_and_stay_the_same(place: Place) -> None:
+    work: Any = SimpleNamespace(metadata={}, save=lambda **values: work.metadata.update(values))
+    settings = Adaptation(minutes=0.5)
+    rows = [json.loads(row) for row in (place.run / "world_model" / "log.jsonl").read_text().splitlines()]
+    seconds = np.median([row["seconds_per_step"] for row in rows if row.get("seconds_per_step")])
+    assert steps_of(place.run, settings, work) == max(1, round(30 / seconds))
+    work.metadata["steps"] = 7
+    assert steps_of(place.run, settings, work) == 7
