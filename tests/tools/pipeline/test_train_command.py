@@ -58,7 +58,9 @@ def test_the_whole_job_leaves_a_report_and_metrics(debug: Path) -> None:
     output = (debug / "output").read_text()
     assert re.findall(r"^\[\d/6\] (\w+)", output, re.MULTILINE) == list(STAGES)
     assert not skipped(output)
-    assert output.rstrip().splitlines()[-1].endswith("report.html")
+    *_, report, after = output.rstrip().splitlines()
+    assert report.startswith("report: ") and report.endswith("report.html")
+    assert after.startswith("done in ") and "rsjax play" in after
     assert not re.search(r"robosuite|macro|UserWarning|DeprecationWarning|Traceback", output), output
     scores = metrics(debug)
     reasons = scores.pop("reasons")
