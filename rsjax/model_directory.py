@@ -207,4 +207,4 @@ def _stored(name: str, x: np.ndarray, dtype: Dtype) -> np.ndarray:
             x = x.astype(dtype)
         if not np.isfinite(x).all():
             raise ModelFileError(f"{name} has values that {dtype} cannot hold; save it as float32")
-    return np.ascontiguousarray(x)
+    return np.ascontiguousarray(x).reshape(x.shape)  # it makes a vector of a scalar

@@ -1,4 +1,4 @@
-"""A whole adaptation of ``debug`` by its command: two rounds, recorded episodes, killed and resumed, and refused."""
+"""An adaptation of ``debug`` by its command: of a policy, of recorded episodes, killed and resumed, and refused."""
 
 import json
 import shutil
@@ -22,7 +22,7 @@ from rsjax.tools.policies.judges.trained_judge import Network, TrainedJudge
 from rsjax.tools.policies.on_policy import FIRST_EPISODE
 from rsjax.tools.policies.policy_training import train_policy
 from rsjax.tools.policies.run_data import RunData
-from rsjax.tools.policies.studies.adaptation import Adaptation, steps_of
+from rsjax.tools.policies.studies.adaptation import Adaptation, adapted, steps_of
 from rsjax.tools.policies.worlds.simulator_world import SimulatorWorld
 from rsjax.tools.sim.episode import clip_seed
 from tests.tools.pipeline.conftest import Commands, command, debug, shared
@@ -57,7 +57,7 @@ def place(debug: Path, command: Commands, tmp_path_factory: pytest.TempPathFacto
     config = toy()
     demos = RunData(run, command.data).demos("all")
     train_policy(replace(config, train=replace(config.train, steps=1)), demos, folder / "policy")
-    done(command, run, "--policy", folder / "policy", *QUICK, "--rounds", 2, "--out", folder / "out")
+    done(command, run, "--policy", folder / "policy", *QUICK, "--out", folder / "out")
     return Place(run, folder / "policy", folder / "out")
 
 
@@ -70,11 +70,11 @@ def results(out: Path) -> dict[str, Any]:
 def test_the_adapted_run_is_a_run_that_began_with_the_weights_and_both_kinds_of_clips(
     place: Place, command: Commands
 ) -> None:
-    adapted = load(place.out / "round-1")
+    after = load(place.out / "round-1")
     before = load(place.run)
-    jax.tree.map(np.testing.assert_array_equal, adapted.assets.tokenizer, before.assets.tokenizer)
+    jax.tree.map(np.testing.assert_array_equal, after.assets.tokenizer, before.assets.tokenizer)
     assert (place.out / "round-1" / "tokens" / "store").resolve() == (place.run / "tokens" / "store").resolve()
-    (stage,) = adapted.config.train.curriculum
+    (stage,) = after.config.train.curriculum
     own, new = stage.components
     assert own.store == "" and own.weight == new.weight == 0.5
     tokens = open_store(new.store)
@@ -102,24 +102,29 @@ def test_the_clips_are_what_the_policy_did(place: Place, command: Commands) -> N
 
 def test_scores_and_success_are_reported_before_and_after(place: Place) -> None:
     found = results(place.out)
-    assert [row["name"] for row in found["models"]] == ["before", "round-1", "round-2"]
+    assert [row["name"] for row in found["models"]] == ["before", "round-1"]
     for row in found["models"]:
         scores = json.loads((Path(row["run"].replace("OUT", str(place.out))) / "metrics.json").read_text())
         assert row["own"]["psnr"] == scores["psnr"] and row["on_policy"]["clips"] == 2
-    before, after, _ = found["models"]
+    before, after = found["models"]
     for kind in ("own", "on_policy"):
         assert before[kind]["gain"]["value"] == 0
         assert after[kind]["gain"]["value"] == pytest.approx(after[kind]["psnr"] - before[kind]["psnr"])
-    assert [row["run"] for row in found["success"]] == ["before", "round-1", "round-2"]
+    assert [row["run"] for row in found["success"]] == ["before", "round-1"]
     text = (place.out / "results.md").read_text()
     assert "| round-1 " in text and "same outcome" in text
 
 
-def test_a_second_round_starts_from_the_first_and_learns_from_both_rounds_episodes(place: Place) -> None:
-    config = load(place.out / "round-2").config
-    assert config.train.start_from == str(place.out / "round-1")
+def test_a_second_round_starts_from_the_first_and_learns_from_both_rounds_episodes(
+    place: Place, command: Commands
+) -> None:
+    data = RunData(place.run, command.data)
+    tokens = [open_store(place.out / "on-policy-1" / "clips" / "tokens")] * 2
+    before = place.out / "round-1"
+    config = adapted(data, [store.path for store in tokens], before, Adaptation(rounds=2), 4, 2)
+    assert config.train.start_from == config.tokenizer_train.start_from == str(before)
     assert [part.weight for part in config.train.curriculum[0].components] == [0.5, 0.25, 0.25]
-    assert "| round-2 " in (place.out / "results.md").read_text()
+    assert config.train.seed == data.config.train.seed + 2
 
 
 def test_recorded_episodes_serve_as_well_and_a_killed_call_that_runs_again_gives_the_same_bytes(
