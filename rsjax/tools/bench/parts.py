@@ -29,7 +29,7 @@ from rsjax.models.roboscape.sample import rollout
 from rsjax.models.trained import TrainedModel
 from rsjax.tools.bench import inputs
 from rsjax.tools.bench.timing import median_seconds
-from rsjax.tools.policies.worlds.environments import WorldModelVectorEnv
+from rsjax.tools.policies.worlds.environments import MOST_STEPS, WorldModelVectorEnv
 from rsjax.training.sharding import Sharding
 from rsjax.training.state import create_state
 from rsjax.training.step import train_step
@@ -183,7 +183,7 @@ def environment(config: Config, budget: float) -> Numbers:
     numbers: Numbers = {}
     for count in ENVIRONMENTS:
         try:
-            env = WorldModelVectorEnv(trained, count, max_steps=10**9)
+            env = WorldModelVectorEnv(trained, count, max_steps=MOST_STEPS)
         except UserError:
             return {}
         env.reset(seed=0, options=first if config.model.uses_depth else {"rgb": first["rgb"]})
