@@ -243,7 +243,7 @@ def test_texts_come_from_a_file_or_are_learned(tmp_path: Path) -> None:
         check_tasks(text, ["lift", "drift"])
     with pytest.raises(UserError, match="its texts have 2 tokens of 4 numbers, the model takes 226 of 4"):
         texts_of(replace(text, tokens=226), None, 1)
-    with pytest.raises(UserError, match="absent: no such file of text embeddings; make it with python -m"):
+    with pytest.raises(UserError, match="absent: no such file of text embeddings; make it with rsjax convert"):
         texts_of(TextConfig(file=str(tmp_path / "absent")), None, 1)
     (tmp_path / "other").write_bytes(b"x")
     with pytest.raises(UserError, match="not a file of text embeddings, or damaged"):
