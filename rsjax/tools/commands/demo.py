@@ -18,8 +18,8 @@ class Options:
     """A name of a model of the package, a saved model, or a run directory."""
     video: bool = False
     """Write the video and the picture, even if there is a display."""
-    clip: int = 0
-    """The clip that they show."""
+    clip: int | None = None
+    """The clip that they show. Default: the first that ends in success."""
     out: Path = Path("rsjax-demo")
     """Their directory."""
     port: int = 8642

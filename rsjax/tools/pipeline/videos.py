@@ -102,8 +102,11 @@ def write_videos(
         yield path
 
 
-def write_demo(model: Path, data_dir: Path, out: Path, number: int) -> list[Path]:
+def write_demo(model: Path, data_dir: Path, out: Path, number: int | None = None) -> list[Path]:
     """Generates a held-out clip from its first frame, under its own actions and under the next clip's.
+
+    Args:
+        number: of the clip; None: the first that ends in success, if one does.
 
     Returns:
         The paths of a video and of a film strip. Their rows: the recording, the two predictions, and depth.
@@ -113,6 +116,8 @@ def write_demo(model: Path, data_dir: Path, out: Path, number: int) -> list[Path
     """
     trained = load(model)
     source = Run(trained.config, model, data_dir).open_clips().source("test")
+    if number is None:
+        number = next((each for each in range(len(source)) if source[each]["success"][-1]), 0)
     if not 0 <= number < len(source):
         raise UserError(f"--clip {number}: the model has clips 0 … {len(source) - 1}")
     clip = source[number]

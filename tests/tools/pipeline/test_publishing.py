@@ -95,6 +95,11 @@ def test_videos_the_demo_and_the_playground_work_from_the_directory_alone(publis
         assert len(list(container.decode(video=0))) == toy.config().sim.frames
     with Image.open(strip) as picture:
         assert min(picture.size) > 100
+    source = PlayRun(RunData(published, Path("nowhere"))).source
+    assert source is not None
+    outcomes = [bool(source[number]["success"][-1]) for number in range(2)]
+    first = outcomes.index(True) if any(outcomes) else 0
+    assert write_demo(published, Path("nowhere"), tmp_path / "demo")[1].name == f"clip-{first}.png"
     with pytest.raises(UserError) as caught:
         write_demo(published, Path("nowhere"), tmp_path / "demo", 2)
     assert str(caught.value) == "--clip 2: the model has clips 0 … 1"
