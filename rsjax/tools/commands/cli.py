@@ -129,12 +129,15 @@ def parse(argv: Sequence[str], prog: str, description: str, options: Options) ->
         ConfigError: an unknown preset or field, a value that does not parse, or an impossible combination.
         SystemExit: with status 0, after printing the requested help.
     """
+    fields: Any
     usage = f"usage: {prog} PRESET [--section.field VALUE]; presets: {', '.join(presets.PRESETS)}"
     if not argv or argv[0].startswith("-"):
         if not {"-h", "--help", "--help-all"}.intersection(argv):
             raise ConfigError(f"name a preset first; {usage}")
         more = f"Options and common fields: {prog} tiny --help; every field: --help-all"
-        print(usage, with_first_screen(f"\n{description}", prog, _help_of_tiny(prog, options)), more, sep="\n")
+        fields = _first_fields(presets.get("tiny"))
+        listed = _help({"options": options, "preset": PresetOptions(), "fields": fields}, prog, "")
+        print(usage, with_first_screen(f"\n{description}", prog, listed), more, sep="\n")
         raise SystemExit(0)
     name, *argv = argv
     command.refuse_repeated(argv, _adding(options))
@@ -143,7 +146,7 @@ def parse(argv: Sequence[str], prog: str, description: str, options: Options) ->
     preset_options = _parse({"preset": PresetOptions()}, argv, prog, "", rest=True).preset
     preset = preset_options.apply(preset)
     chosen, argv = choose_sections(preset, argv)
-    fields: Any = chosen
+    fields = chosen
     if {"-h", "--help"}.intersection(argv):
         fields = _first_fields(chosen)
         description = f"{description} Every field: {prog} --help-all"
@@ -273,12 +276,6 @@ def _remember(prog: str, options: Any, run: Path | None = None) -> None:
 def _name(prog: str) -> str:
     """Returns the name of a command as the user types it: play, of ``rsjax play``."""
     return [*prog.split(), "", ""][1]
-
-
-def _help_of_tiny(prog: str, options: Any) -> str:
-    """Returns the help of a command for the preset tiny."""
-    tiny = presets.get("tiny")
-    return _help({"options": options, "preset": PresetOptions(), "fields": _first_fields(tiny)}, prog, "")
 
 
 def _help(parts: dict[str, Any], prog: str, description: str) -> str:
