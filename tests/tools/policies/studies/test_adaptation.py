@@ -119,9 +119,9 @@ def test_a_second_round_starts_from_the_first_and_learns_from_both_rounds_episod
     place: Place, command: Commands
 ) -> None:
     data = RunData(place.run, command.data)
-    tokens = [open_store(place.out / "on-policy-1" / "clips" / "tokens")] * 2
     before = place.out / "round-1"
-    config = adapted(data, [store.path for store in tokens], before, Adaptation(rounds=2), 4, 2)
+    _, new = load(before).config.train.curriculum[0].components
+    config = adapted(data, [Path(new.store)] * 2, before, Adaptation(rounds=2), 4, 2)
     assert config.train.start_from == config.tokenizer_train.start_from == str(before)
     assert [part.weight for part in config.train.curriculum[0].components] == [0.5, 0.25, 0.25]
     assert config.train.seed == data.config.train.seed + 2

@@ -153,7 +153,7 @@ def test_equal_time_is_equal_steps_times_their_seconds(three_hours: Plan) -> Non
     assert genie.train.steps * step_seconds(genie) == pytest.approx(base.train.steps * step_seconds(base), rel=0.01)
 
 
-@pytest.mark.parametrize(("preset", "simple"), [("roboscape_tiny", 0.55), ("multitask", 0.5)])
+@pytest.mark.parametrize(("preset", "simple"), [("roboscape_tiny", 0.55), ("roboscape_multitask", 0.5)])
 def test_a_curriculum_and_its_mixture_read_the_same_clips_in_as_many_steps(preset: str, simple: float) -> None:
     """With as many clips of each difficulty as expected, every clip is drawn as often in both."""
     at = scale(presets.get(preset), 3 * HOUR)
@@ -214,7 +214,7 @@ def test_equal_operations_count_the_shared_tokenizer(three_hours: Plan) -> None:
 
 
 def test_all_families_can_be_compared_on_several_tasks() -> None:
-    plan = make_plan(chosen(["table1"], claims()), scale(presets.get("multitask"), 12 * HOUR), DATA)
+    plan = make_plan(chosen(["table1"], claims()), scale(presets.get("roboscape_multitask"), 12 * HOUR), DATA)
     assert not plan.absent
     models = {arm.name: plan.of("table1", arm.name)[0].config for arm in plan.claims[0].arms}
     assert {config.sim for config in models.values()} == {plan.scale.base.sim}

@@ -58,7 +58,7 @@ def _register_unseen(split: str, name: str) -> None:
         """Scores simulated clips whose task, camera or colours do not occur in training."""
         config = run.config
         if split not in unseen_splits(config.sim):
-            raise Unavailable(f"{config.sim.env} has one task; the preset multitask holds tasks out")
+            raise Unavailable(f"{config.sim.env} has one task; the preset roboscape_multitask holds tasks out")
         with Progress("collect", config.eval.clips * len(unseen_splits(config.sim)), "unseen episodes") as progress:
             show = lambda done, total: progress.update(done)  # noqa: E731
             store = collect_unseen(config.sim, run.open_clips(), config.eval.clips, show)
