@@ -127,25 +127,21 @@ def test_a_second_round_starts_from_the_first_and_learns_from_both_rounds_episod
     assert config.train.seed == data.config.train.seed + 2
 
 
-def test_recorded_episodes_serve_as_well_and_a_killed_call_that_runs_again_gives_the_same_bytes(
+def test_a_call_on_the_episodes_that_is_killed_and_runs_again_gives_the_same_bytes_as_the_policies_whole_call(
     place: Place, command: Commands, tmp_path: Path
 ) -> None:
     store = place.out / "on-policy-1" / "episodes"
-    words = (place.run, "--episodes", store, "--steps", 4, "--out")
-    done(command, *words, tmp_path / "whole")
-    found = results(tmp_path / "whole")
-    assert "success" not in found
-    assert found["models"][0]["on_policy"] == results(place.out)["models"][0]["on_policy"]
-
-    out = tmp_path / "out"
-    killed = command("tests.tools.policies.killed", *words, out)
+    words = (place.run, "--episodes", store, "--steps", 4, "--out", tmp_path)
+    killed = command("tests.tools.policies.killed", *words)
     assert killed.returncode == -signal.SIGKILL, killed.stderr
-    done(command, *words, out)
+    done(command, *words)
     for file in ("on-policy-1/clips/train-00000.array_record", "on-policy-1/clips/test-00000.array_record"):
-        assert (out / file).read_bytes() == (tmp_path / "whole" / file).read_bytes()
-    params = [load(each / "round-1").params for each in (out, tmp_path / "whole")]
+        assert (tmp_path / file).read_bytes() == (place.out / file).read_bytes()
+    params = [load(each / "round-1").params for each in (tmp_path, place.out)]
     jax.tree.map(np.testing.assert_array_equal, *params)
-    assert results(out) == found
+    found = results(tmp_path)
+    assert "success" not in found
+    assert found["models"] == results(place.out)["models"]
 
 
 def test_what_cannot_be_adapted_is_refused(place: Place, command: Commands) -> None:
