@@ -43,8 +43,9 @@ def check_manifest(manifest: dict[str, Any]) -> None:
     for name, (kinds, inner) in OPTIONAL.items():
         if (value := manifest.get(name)) is not None:
             _require(name, type(value) in kinds)
-            items = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
-            _require(name, not inner or all(type(item) in inner for item in items))
+            if inner:
+                items = value.values() if isinstance(value, dict) else value
+                _require(name, all(type(item) in inner for item in items))
     windows = (manifest.get("counts") or {}).get("windows", {})
     _require("counts.windows", isinstance(windows, dict) and all(type(count) is int for count in windows.values()))
     _require("config.control_steps", type((manifest.get("config") or {}).get("control_steps", 1)) is int)

@@ -174,18 +174,25 @@ def cut(annotated: Annotated, config: ClipConfig) -> Records:
             "success": success,
             **_words(annotated, config, camera, frames, unit),
         }
-    return {
+    summary = {
         "windows": tally(reasons),
         "left_out": starts_by_reason(index, reasons),
         "fit": pictures.placement.words if pictures.placement else "",
         "short": _short(index, spans, episode.fps, windows, annotated.shots),
-        "actions": statistics.to_json() if statistics else None,
-        "action_dim": len(statistics.mean) if statistics else None,
-        "dimensions": describe_dimensions(layout, names, config.actions, len(statistics.mean)) if statistics else [],
-        "depth": [near, far] if far > 0 else None,
-        "depth_unit": unit if far > 0 else None,
+        "actions": None,
+        "action_dim": None,
+        "dimensions": [],
+        "depth": None,
+        "depth_unit": None,
         "success": succeeded if "success" in episode.meta else None,
     }
+    if statistics:
+        width = len(statistics.mean)
+        dimensions = describe_dimensions(layout, names, config.actions, width)
+        summary |= {"actions": statistics.to_json(), "action_dim": width, "dimensions": dimensions}
+    if far > 0:
+        summary |= {"depth": [near, far], "depth_unit": unit}
+    return summary
 
 
 def _short(

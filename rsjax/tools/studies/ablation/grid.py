@@ -132,7 +132,11 @@ def parse_value(name: str, kind: Any, text: str) -> Value:
     Raises:
         ConfigError: the text is not of this type, or the field takes more than one value.
     """
-    options = (True, False) if kind is bool else typing.get_args(kind) if typing.get_origin(kind) is Literal else ()
+    options: tuple[Any, ...] = ()
+    if kind is bool:
+        options = (True, False)
+    elif typing.get_origin(kind) is Literal:
+        options = typing.get_args(kind)
     if options:
         choices = {str(option): option for option in options}
         problem = f"{name} is {text!r} in the grid{did_you_mean(text, choices)} (choices: {', '.join(choices)})"

@@ -171,7 +171,11 @@ def arm_config(arm: Arm, scale: Scale, seed: int, vary: Vary = "model") -> Confi
         ConfigError: there is no such preset, or the base preset lacks a field of the arm's.
     """
     base = scale.base
-    config = _small(arm, base) if arm.preset else base.with_family(arm.model) if arm.model else base
+    config = base
+    if arm.preset:
+        config = _small(arm, base)
+    elif arm.model:
+        config = base.with_family(arm.model)
     try:
         config = with_values(config, {**arm.values, SEED: seed})
         if vary == "everything":

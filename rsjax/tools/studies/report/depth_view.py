@@ -57,8 +57,12 @@ def depth_scale(
     strip.paste(Image.fromarray(np.repeat(depth_to_colors(depths, near, far)[None], _BAR, axis=0)), (0, 2))
     draw = ImageDraw.Draw(strip)
     ticks = np.linspace(0, width - 1, max(2, width // _TICK_APART + 1)).round().astype(int)
-    for number, x in enumerate(ticks):
-        anchor = "lt" if number == 0 else "rt" if number == len(ticks) - 1 else "mt"
-        text = f"{depths[x]:.3g}{' m' if unit == 'metres' else ' (no unit)' if anchor == 'rt' else ''}"
+    texts = [f"{depths[x]:.3g}" for x in ticks]
+    if unit == "metres":
+        texts = [f"{text} m" for text in texts]
+    else:
+        texts[-1] += " (no unit)"
+    anchors = ["lt", *["mt"] * (len(ticks) - 2), "rt"]
+    for x, text, anchor in zip(ticks, texts, anchors, strict=True):
         draw.text((int(x), _BAR + 7), text, fill=(222, 225, 230), font=font(11), anchor=anchor)
     return np.asarray(strip)
