@@ -6,7 +6,7 @@ python := $(VENV)/bin/python
 # When a test ends its process, the run ends, too: in a new process, xdist would run the same test again.
 in_parallel := -n $(JOBS) --max-worker-restart 0
 
-.PHONY: help setup train test wheel-test extras accelerators accelerators-test lint docs clean
+.PHONY: help setup train test wheel-test extras accelerators accelerators-test lint audit docs clean
 
 help:  ## this list
 	@sed -n 's/^\([a-z-]*\):[^#]*## /make \1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 24
@@ -39,6 +39,9 @@ lint: setup  ## ruff, mypy, and the numbers that may only fall
 	@$(python) -m ruff format --check
 	@$(python) -m mypy
 	@$(python) -m scripts.ratchets
+
+audit: setup  ## known vulnerabilities of the pinned packages, by PyPI's advisories (needs the network)
+	@scripts/audit.sh "$(VENV)"
 
 docs: setup  ## the documentation as a site, in site/; open site/index.html
 	@$(python) -c 'import mkdocstrings, material' 2>/dev/null || $(python) -m pip install --quiet --progress-bar off -c requirements.txt -r requirements-docs.txt
