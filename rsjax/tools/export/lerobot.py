@@ -12,12 +12,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Shaped
 
 from rsjax.clip import GENERATED, GENERATED_MARK
 from rsjax.config.fields import require_range
 from rsjax.data.clips import frame_rate, keeps_rate, readable
 from rsjax.data.codec import Record
+from rsjax.data.state_labels import knows_success
 from rsjax.data.store import Store, StoreError
 from rsjax.errors import UserError
 from rsjax.files import disk_guard, making, replace_directory, write_json
@@ -28,12 +29,12 @@ from rsjax.tools.export.lerobot_files import (
     LeRobotEpisode,
     VideoSettings,
     describe_features,
+    outcome_columns,
     video_rate,
 )
-from rsjax.tools.ingest.formats.lerobot import EXPORTED
+from rsjax.tools.ingest.formats.lerobot import EXPORTED, PROVENANCE
 
 LAYOUTS: dict[str, type[LayoutV30 | LayoutV21]] = {"v3.0": LayoutV30, "v2.1": LayoutV21}
-PROVENANCE = "provenance.json"  # beside info.json, where LeRobot reads no other file: which episodes a model generated
 CONTROLS = ("delta_x", "delta_y", "delta_z", "delta_roll", "delta_pitch", "delta_yaw", "gripper")  # of simulated Lift
 # Names of a constant state's numbers; from one number LeRobot would make (B, T), but its policies want (B, T, D).
 ZEROS = ("zero_0", "zero_1")
@@ -88,7 +89,8 @@ def export_lerobot(
         UserError: ``out`` exists, the store has no clips, or their sizes or frame rates differ or do not suit a video.
         FileError: the disk is full, or ``out`` cannot be written.
 
-    If a world model generated some of the clips, ``meta/provenance.json`` lists these episodes.
+    If a world model generated some of the clips, ``meta/provenance.json`` lists these episodes. Rows have the columns
+    ``next.success``, ``next.reward`` and ``next.done`` if the store knows which clips succeed.
     """
     if out.exists():
         raise UserError(f"{out}: exists; choose another place for the data set, or move it away")
@@ -186,7 +188,8 @@ def _layout(store: Store, clip: Record, root: Path, options: LeRobotOptions) -> 
     width = clip["actions"].shape[1]
     states = {"zeros": ZEROS, "command": _names(store, width), "none": None}[options.state]
     video = VideoSettings(options.codec, options.crf, fps, size)
-    return LAYOUTS[options.version](root, video, describe_features(video, _camera(clip), _names(store, width), states))
+    features = describe_features(video, _camera(clip), _names(store, width), states, knows_success(store))
+    return LAYOUTS[options.version](root, video, features)
 
 
 def _camera(clip: Record) -> str:
@@ -203,11 +206,13 @@ def _names(store: Store, width: int) -> list[str]:
 
 def _episode(clip: Record, features: dict[str, Any], state: str) -> LeRobotEpisode:
     actions = clip["actions"]
-    columns: dict[str, Float32[np.ndarray, "T D"]] = {"action": np.concatenate([actions[1:], actions[-1:]])}
+    columns: dict[str, Shaped[np.ndarray, "T ..."]] = {"action": np.concatenate([actions[1:], actions[-1:]])}
     if "observation.state" in features:
         zeros = np.zeros((len(actions), len(ZEROS)), np.float32)
         if state == "command":
             columns["observation.state"] = actions
         else:
             columns["observation.state"] = zeros
+    if "next.success" in features:
+        columns |= outcome_columns(clip["success"])
     return LeRobotEpisode(clip["rgb"], columns, str(clip["task"]))

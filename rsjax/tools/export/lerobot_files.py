@@ -16,7 +16,7 @@ import av
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from jaxtyping import Float32, Num, UInt8
+from jaxtyping import Bool, Num, Shaped, UInt8
 
 ENCODERS = {"av1": "libsvtav1", "h264": "libx264"}
 KEY_FRAMES = 2  # frames from one key frame to the next: LeRobot's choice, as training reads frames in random order
@@ -28,6 +28,7 @@ COUNTERS = {
     "index": "int64",
     "task_index": "int64",
 }
+OUTCOME = {"next.reward": "float32", "next.success": "bool", "next.done": "bool"}
 CHUNK = 1000  # episodes (v2.1) or files (v3.0) in a folder
 DATA_MEGABYTES = 100  # size after which v3.0 begins another table
 VIDEO_MEGABYTES = 200  # size after which v3.0 begins another video
@@ -104,19 +105,37 @@ Stats = dict[str, dict[str, np.ndarray]]  # feature → min, max, mean, std, cou
 
 
 def describe_features(
-    video: VideoSettings, camera: str, action: Sequence[str], state: Sequence[str] | None
+    video: VideoSettings, camera: str, action: Sequence[str], state: Sequence[str] | None, outcome: bool = False
 ) -> dict[str, dict[str, Any]]:
-    """Returns the ``features`` of ``info.json``: one camera, the action, a state if there is one, and row counters."""
+    """Returns the ``features`` of ``info.json``: one camera, the action, a state if there is one, and row counters.
+
+    Args:
+        outcome: whether rows say what their action led to.
+    """
     pictures = {"dtype": "video", "shape": [video.size, video.size, 3], "names": ["height", "width", "channels"]}
     features: dict[str, dict[str, Any]] = {f"observation.images.{camera}": pictures | {"info": video.describe()}}
     numbers = {"observation.state": state, "action": action}
     for name, names in numbers.items():
         if names is not None:
             features[name] = {"dtype": "float32", "shape": [len(names)], "names": list(names)}
-    return features | {name: {"dtype": dtype, "shape": [1], "names": None} for name, dtype in COUNTERS.items()}
+    single = COUNTERS
+    if outcome:
+        single = OUTCOME | COUNTERS
+    return features | {name: {"dtype": dtype, "shape": [1], "names": None} for name, dtype in single.items()}
 
 
-def rows_table(columns: Mapping[str, Num[np.ndarray, "T ..."]]) -> pa.Table:
+def outcome_columns(success: Bool[np.ndarray, " T"]) -> dict[str, Shaped[np.ndarray, " T"]]:
+    """Returns what each row's action led to: the success of the next frame, a reward of 1 for it, and the last row.
+
+    The last row speaks of the last frame, since no frame follows.
+    """
+    reached = np.append(success[1:], success[-1])
+    done = np.arange(len(success)) == len(success) - 1
+    columns = {"next.reward": reached, "next.success": reached, "next.done": done}
+    return {name: values.astype(OUTCOME[name]) for name, values in columns.items()}
+
+
+def rows_table(columns: Mapping[str, Shaped[np.ndarray, "T ..."]]) -> pa.Table:
     """Returns columns as a table; columns with several numbers per row become lists of fixed length, as in LeRobot.
 
     A column with one number per row becomes scalars, even if it has two axes: that is how LeRobot reads the shape [1].
@@ -132,7 +151,7 @@ def rows_table(columns: Mapping[str, Num[np.ndarray, "T ..."]]) -> pa.Table:
     return pa.table(arrays)
 
 
-def column_stats(values: Num[np.ndarray, "T ..."]) -> dict[str, np.ndarray]:
+def column_stats(values: Shaped[np.ndarray, "T ..."]) -> dict[str, np.ndarray]:
     """Returns one column's statistics over an episode, each (D,) or (1,); "std" is that of the population (1 / T)."""
     wide = values.astype(np.float64).reshape(len(values), -1)
     return _stats(wide, len(values))
@@ -198,12 +217,12 @@ class LeRobotEpisode:
 
     Attributes:
         rgb: the episode's frames.
-        columns: its ``action`` and, if it has one, its ``observation.state``.
+        columns: its ``action`` and, if it has them, its ``observation.state`` and its outcome.
         task: in words.
     """
 
     rgb: UInt8[np.ndarray, "T H W 3"]
-    columns: dict[str, Float32[np.ndarray, "T D"]]
+    columns: dict[str, Shaped[np.ndarray, "T ..."]]
     task: str
 
 

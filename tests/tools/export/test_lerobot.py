@@ -19,7 +19,10 @@ from rsjax.data.merge import merge
 from rsjax.data.store import Store
 from rsjax.errors import UserError
 from rsjax.tools.export import lerobot_files
-from rsjax.tools.export.lerobot import PROVENANCE, LeRobotOptions, export_lerobot, openpi_advice, padding
+from rsjax.tools.export.lerobot import LeRobotOptions, export_lerobot, openpi_advice, padding
+from rsjax.tools.export.lerobot_files import OUTCOME
+from rsjax.tools.ingest.formats import open_source
+from rsjax.tools.ingest.formats.lerobot import PROVENANCE
 from rsjax.tools.ingest.ingest import ingest
 from rsjax.tools.ingest.options import IngestOptions, make_plan
 from rsjax.tools.ingest.windows import WindowConfig
@@ -92,16 +95,49 @@ def test_episodes_that_a_model_generated_are_listed(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("version", ["v3.0", "v2.1"])
 def test_ingested_again_the_clips_are_the_same(tmp_path: Path, version: Any) -> None:
-    store = toy_store(tmp_path / "store")
-    export_lerobot(store, tmp_path / "out", LeRobotOptions(version, crf=1))
+    success = np.array([False, False, True, False, True, True])
+    store = toy_store(tmp_path / "store", success=success, provenance={"source": GENERATED})
+    info = export_lerobot(store, tmp_path / "out", LeRobotOptions(version, crf=1))
+    assert {name: info["features"][name]["dtype"] for name in OUTCOME} == OUTCOME
     off = dict.fromkeys(("shots", "motion", "depth", "tracks", "semantics"), "none")
     windows = WindowConfig(frames=6, rate=0, hop=6)
     options = IngestOptions(out=tmp_path / "again", windows=windows, image_size=32, test_share=0.0, **off)  # type: ignore[arg-type]
     ingest(make_plan("lerobot", tmp_path / "out", options))
-    for old, new in zip(records(store), records(rsjax.open_store(tmp_path / "again")), strict=True):
+    again = rsjax.open_store(tmp_path / "again")
+    for old, new in zip(records(store), records(again), strict=True):
         np.testing.assert_array_equal(new["actions"], old["actions"])
+        np.testing.assert_array_equal(new["success"], old["success"])
         assert_near(new["rgb"], old["rgb"])
         assert new["task"] == old["task"]
+        assert new["provenance"]["source"] == GENERATED
+        assert new["provenance"]["reward"] == success.astype(float).tolist()
+    export_lerobot(again, tmp_path / "once more", LeRobotOptions(version, codec="h264"))
+    marks = [json.loads((tmp_path / name / "meta" / PROVENANCE).read_text()) for name in ("out", "once more")]
+    assert marks[0] == marks[1]
+
+
+@pytest.mark.parametrize("version", ["v3.0", "v2.1"])
+def test_rows_say_what_their_action_led_to_where_the_store_knows(tmp_path: Path, version: Any) -> None:
+    success = np.array([False, True, False, False, False, True])
+    export_lerobot(toy_store(tmp_path / "store", 2, success=success), tmp_path / "out", LeRobotOptions(version, crf=1))
+    table = pq.read_table(next((tmp_path / "out").glob("data/*/*.parquet")), columns=list(OUTCOME))
+    rows = {name: table[name].to_pylist()[:6] for name in OUTCOME}
+    assert rows["next.success"] == [True, False, False, False, True, True]
+    assert rows["next.reward"] == [1.0, 0.0, 0.0, 0.0, 1.0, 1.0]
+    assert rows["next.done"] == [False] * 5 + [True]
+    info = export_lerobot(toy_store(tmp_path / "unknown", 2), tmp_path / "other", LeRobotOptions(version, crf=1))
+    assert not info["features"].keys() & OUTCOME.keys()
+
+
+def test_a_damaged_list_of_generated_episodes_is_named(tmp_path: Path) -> None:
+    made = toy_store(tmp_path / "generated", 2, provenance={"source": GENERATED})
+    export_lerobot(made, tmp_path / "out", LeRobotOptions(crf=1))
+    path = tmp_path / "out" / "meta" / PROVENANCE
+    for text in ("", "[]", "{}", '{"generated_episodes": ["x"]}', '{"generated_episodes": 3}'):
+        path.write_text(text)
+        with pytest.raises(UserError) as caught:
+            open_source("lerobot", tmp_path / "out")
+        assert str(path) in str(caught.value)
 
 
 @pytest.mark.parametrize("version", ["v3.0", "v2.1"])

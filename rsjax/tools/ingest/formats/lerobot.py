@@ -16,7 +16,7 @@ import numpy as np
 import pyarrow as pa
 from jaxtyping import Float, UInt8
 
-from rsjax.clip import words_of
+from rsjax.clip import GENERATED, words_of
 from rsjax.files import safe_id
 from rsjax.tools.ingest.actions import Declared, Kind, align_actions, check_layout, flat_names, layout_of
 from rsjax.tools.ingest.episode import (
@@ -50,7 +50,8 @@ from rsjax.tools.ingest.pictures import decode_pictures
 from rsjax.tools.ingest.video import at_times
 
 TOLERANCE = 1e-4  # seconds, LeRobot's own tolerance
-EXPORTED = "rsjax.json"  # in meta, of a data set that experiments.export wrote
+EXPORTED = "rsjax.json"  # in meta, of a data set that rsjax export wrote
+PROVENANCE = "provenance.json"  # in meta, where LeRobot reads no such file: which episodes a world model generated
 OUTCOME = ("next.reward", "next.success", "next.done")
 _PLACES = ("chunk_index", "file_index")
 _BEGINS = "from_timestamp"
@@ -84,13 +85,14 @@ def open_source(
         raise SourceError(f"{path}: has no column {action!r}; choose among {', '.join(info.features)}")
     tasks = _tasks(path / "meta", info.shared)
     exported = exists(path / "meta" / EXPORTED)
+    generated = _generated(path / "meta" / PROVENANCE)
     names = str(info.features[action].get("names")).lower()
     if held is None:
         stay = None
     else:
         stay = tuple(held)
     declared = Declared(kind or (None if "delta" in names else "absolute"), stay, tuple(quaternions))
-    return LeRobot(path, info, tasks, declared, action, state, exported)
+    return LeRobot(path, info, tasks, declared, action, state, exported, generated)
 
 
 @dataclass(frozen=True)
@@ -167,6 +169,7 @@ class LeRobot:
         action: str,
         state: str,
         exported: bool = False,
+        generated: frozenset[int] = frozenset(),
     ) -> None:
         self._root = root
         self._info = info
@@ -175,6 +178,7 @@ class LeRobot:
         self._action = action
         self._state = state
         self._exported = exported  # by this project, which writes clips: each is one shot
+        self._generated = generated
 
     def episodes(self) -> Iterator[EpisodeRef]:
         """Lists ``meta/episodes``; a bad or repeated entry becomes a reference that cannot be read."""
@@ -222,6 +226,8 @@ class LeRobot:
         meta |= _outcome(table, path, notes)
         if self._exported:
             meta["one_shot"] = True
+        if location.get("generated"):
+            meta["source"] = GENERATED
         if notes:
             meta["notes"] = notes
         episode = Episode(
@@ -270,6 +276,8 @@ class LeRobot:
 
         location: dict[str, Any] = {"episode": number, "length": length}
         location["tasks"] = [text for task in row.get("tasks") or () if (text := words_of(task))]
+        if number in self._generated:
+            location["generated"] = True
         location["data"] = fill(info.data_path, **fields("data"))
         if info.shared:
             location["rows"] = [int(row["dataset_from_index"]), int(row["dataset_to_index"])]
@@ -367,6 +375,19 @@ def _numbers(table: pa.Table, column: str, path: Path) -> Float[np.ndarray, "N 1
     if values.shape[1] != 1 or not np.isfinite(values).all():
         raise EpisodeError.at(path, f"column {column!r} is not one finite number a row")
     return values
+
+
+def _generated(path: Path) -> frozenset[int]:
+    """Returns the numbers of the episodes that a world model generated, as an export of rsjax lists them."""
+    if not exists(path):
+        return frozenset()
+    try:
+        numbers = read_json(path)["generated_episodes"]
+        if not isinstance(numbers, list) or not all(type(number) is int for number in numbers):
+            raise TypeError(f"generated_episodes is {numbers!r:.40}, not a list of numbers")
+    except (KeyError, TypeError) as error:
+        raise SourceError(f"{path}: field missing or wrong ({error}); fetch the file again") from error
+    return frozenset(numbers)
 
 
 def _tasks(meta: Path, shared: bool) -> dict[int, str]:
