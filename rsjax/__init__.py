@@ -48,12 +48,13 @@ def examples(model: "Path | str" = "tiny") -> "Source":
         The clips: ``len(clips)``, and ``clips[0]``, a dict with the fields of :class:`rsjax.clip.Clip`.
 
     Raises:
-        rsjax.data.store.StoreError: there are none.
+        rsjax.errors.UserError: there are none, or ``model`` is no path.
     """
     from rsjax.data import store
+    from rsjax.files import checked_path
     from rsjax.model_directory import CLIPS, locate
 
-    return store.open_store(locate(model) / CLIPS).source("test")
+    return store.open_store(locate(checked_path(model, "model")) / CLIPS).source("test")
 
 
 def open_store(path: "Path | str") -> "Store":

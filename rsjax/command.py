@@ -13,6 +13,7 @@ from collections.abc import Collection, Iterator, Sequence
 from rsjax.errors import Preempted, UserError, storage_limit
 from rsjax.runtime import INTERRUPTED, TERMINATED, exit_now, stop_signals
 
+LONGEST_WORD = 400  # characters of a word in a message, such as a path; longer ones are cut off
 UNREAD = 128 + signal.SIGPIPE  # the exit status of a process that SIGPIPE ends
 
 
@@ -128,13 +129,19 @@ _JAX_REFUSES = re.compile(
 
 
 def _exit(line: str, status: int) -> None:
-    print(" ".join(line.split()), file=sys.stderr)
+    print(_readable(line), file=sys.stderr)
     # At exit, the processes of a distributed run wait for each other. A process that failed would wait in vain, and jax
     # would then abort with its own status.
     orderly = (os.EX_TEMPFAIL,) if _has_peers() else (UserError.status,)
     if status not in orderly:
         exit_now(status)
     raise SystemExit(status)
+
+
+def _readable(line: str) -> str:
+    """Returns a message as one line of what can be seen: control characters escaped, and long words cut off."""
+    words = [word if len(word) <= LONGEST_WORD else f"{word[:80]}… ({len(word)} characters)" for word in line.split()]
+    return "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in " ".join(words))
 
 
 def is_lead() -> bool:

@@ -147,7 +147,7 @@ def save_directory(
     with disk_guard(directory):
         shutil.rmtree(new, ignore_errors=True)
         write_file(new / TENSORS, safetensors.numpy.save(tensors, {"format": "rsjax"}))
-        write_file(new / CARD, card.encode())
+        write_file(new / CARD, card.encode(errors="replace"))
         section = {"rsjax": __version__, "dtype": dtype, "files": digests(new, [TENSORS])} | saved
         write_json(new / SETTINGS, settings | {SECTION: section})
         replace_directory(new, directory.absolute())

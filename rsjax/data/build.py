@@ -3,6 +3,7 @@
 Axes: T frames, S×S pixels, A action dimensions, N₀ tracks.
 """
 
+import contextlib
 import dataclasses
 import hashlib
 import json
@@ -23,6 +24,7 @@ from rsjax.data.store import MANIFEST, WRITER_OPTIONS, Source, Store, StoreError
 from rsjax.errors import did_you_mean
 from rsjax.files import checked_path, disk_guard, making
 
+MOST_FPS = 10_000.0  # more is a mistake, not a camera
 TRACKS = 256  # number of empty tracks of a clip without tracks
 _LABELS = ("difficulty", "scene", "segment", "skill")
 _FIELDS = (*(field.name for field in dataclasses.fields(Clip)), "episode", "fps", *_LABELS)
@@ -46,8 +48,10 @@ def write_clips(path: Path | str, clips: Iterable[Mapping[str, Any] | Clip], tes
     if path.exists() and not (path / MANIFEST).exists():
         raise StoreError(f"{path}: exists and is not a store; move it away or choose another place")
     episodes: dict[str, _Episode] = {}
-    if not isinstance(clips, Iterable):
-        raise StoreError(f"clips are {clips!r:.80}; give an iterable of clips")
+    try:
+        given_clips = iter(clips)
+    except TypeError as error:
+        raise StoreError(f"clips are {clips!r:.80}; give an iterable of clips") from error
     first: dict[str, tuple[int, ...]] = {}
     digest = hashlib.sha256()
     scored = False
@@ -57,7 +61,7 @@ def write_clips(path: Path | str, clips: Iterable[Mapping[str, Any] | Clip], tes
         spool = Path(folder) / "clips.array_record"
         writer = ArrayRecordWriter(str(spool), WRITER_OPTIONS)
         count = 0
-        for clip in clips:
+        for clip in given_clips:
             given = encode_clip(clip) if isinstance(clip, Clip) else clip
             if not isinstance(given, Mapping):
                 raise StoreError(f"clip {count}: is a {type(given).__name__}, should be a dict with rgb and actions")
@@ -162,7 +166,7 @@ def _record(clip: Mapping[str, Any], where: str, number: int) -> Record:
         tracks = _array(clip, "tracks", where, f"numbers (N, {count}, 2)", np.float32, (None, count, 2))
         visible = _array(clip, "visible", where, f"bool {tracks.shape[:2]}", np.bool_, tracks.shape[:2])
     origin = {"source": "write_store", "episode": number} | _provenance(clip, where)
-    words = {name: words_of(clip.get(name)) or words_of(origin.get(name)) or UNKNOWN for name in _LABELS}
+    words = {name: _text(clip, name, where) or words_of(origin.get(name)) or UNKNOWN for name in _LABELS}
     timing = {} if clip.get("fps") is None else {"fps": _rate(clip["fps"], where), "frames": list(range(count))}
     unit = {"depth_unit": "metres" if depth is not None else ""}
     return {
@@ -172,13 +176,30 @@ def _record(clip: Mapping[str, Any], where: str, number: int) -> Record:
         "tracks": tracks,
         "visible": visible,
         "success": _success(clip, where, count),
-        "task": words_of(clip.get("task")) or UNKNOWN,
-        "provenance": origin | words | timing | unit | {"episode": str(clip.get("episode", origin["episode"]))},
+        "task": _text(clip, "task", where) or UNKNOWN,
+        "provenance": origin | words | timing | unit | {"episode": _name(clip, where) or str(origin["episode"])},
     }
 
 
+def _text(clip: Mapping[str, Any], name: str, where: str) -> str:
+    """Returns a field of words; "" if it is missing, None or NaN, as pandas writes a missing text."""
+    value = clip.get(name)
+    if value is None or isinstance(value, str) or (isinstance(value, float) and math.isnan(value)):
+        return words_of(value)
+    raise StoreError(f"{where}: {name} is {value!r:.80}; it is text")
+
+
+def _name(clip: Mapping[str, Any], where: str) -> str:
+    """Returns the name of a clip's episode; "" if it has none."""
+    name = clip.get("episode", "")
+    if isinstance(name, str | int | np.integer) and not isinstance(name, bool):
+        with contextlib.suppress(ValueError):  # a number of more digits than Python writes
+            return str(name)
+    raise StoreError(f"{where}: episode is {name!r:.80}; it is a name, or a number")
+
+
 def _success(clip: Mapping[str, Any], where: str, count: int) -> Bool[np.ndarray, " T"]:
-    success = np.asarray(False if clip.get("success") is None else clip["success"])
+    success = _as_array(False if clip.get("success") is None else clip["success"], f"{where}: success")
     if success.shape not in ((), (count,)):
         raise StoreError(f"{where}: success has the shape {success.shape}, should be one value or ({count},)")
     if success.dtype.kind not in "biuf" or not np.isin(success, (0, 1)).all():
@@ -190,10 +211,13 @@ def _rate(fps: Any, where: str) -> float:
     """Returns frames per second."""
     try:
         rate = float(fps)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         rate = math.nan
-    if not 0 < rate < math.inf:
-        raise StoreError(f"{where}: fps is {fps!r:.80}; it is frames per second, above 0: leave it out if unknown")
+    if isinstance(fps, bool) or not 0 < rate <= MOST_FPS:
+        raise StoreError(
+            f"{where}: fps is {fps!r:.80}; it is frames per second, above 0 and at most {MOST_FPS:g}: leave it out if "
+            f"unknown"
+        )
     return rate
 
 
@@ -203,7 +227,8 @@ def _provenance(clip: Mapping[str, Any], where: str) -> dict[str, Any]:
         if not isinstance(origin, Mapping):
             raise TypeError(f"it is a {type(origin).__name__}")
         json.dumps(dict(origin))
-    except (TypeError, ValueError) as error:
+        encode(dict(origin))  # which takes integers of 64 bits only
+    except (TypeError, ValueError, OverflowError) as error:
         raise StoreError(f"{where}: provenance is no dict of JSON-ready values ({error})") from error
     return dict(origin)
 
@@ -214,7 +239,7 @@ def _array(
     """Returns a field as an array of this type and shape; None stands for any length."""
     if clip.get(name) is None:
         raise StoreError(f"{where}: has no {name}; give {expected}")
-    array = np.asarray(clip[name])
+    array = _as_array(clip[name], f"{where}: {name}")
     fits = array.ndim == len(shape) and all(
         wanted in (None, side) for wanted, side in zip(shape, array.shape, strict=True)
     )
@@ -226,6 +251,13 @@ def _array(
     if kind is np.float32 and not np.isfinite(array).all():
         raise StoreError(f"{where}: {name} has values that are not finite; leave the clip out")
     return array
+
+
+def _as_array(value: Any, what: str) -> np.ndarray:
+    try:
+        return np.asarray(value)
+    except (TypeError, ValueError) as error:  # lists of other lengths
+        raise StoreError(f"{what} cannot be made an array ({error}); give numbers of one shape") from error
 
 
 def _check_alike(shapes: dict[str, tuple[int, ...]], first: dict[str, tuple[int, ...]], where: str) -> None:

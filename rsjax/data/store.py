@@ -70,8 +70,10 @@ class Source:
         return self.__dict__ | {"_reader": None}
 
     def __getitem__(self, index: int) -> Record:
+        if isinstance(index, bool) or not isinstance(index, int | np.integer):
+            raise StoreError(f"record {index!r:.80} of a split; records are numbered from 0 to {len(self) - 1}")
         if not 0 <= index < len(self):
-            raise IndexError(f"record {index} of a split with {len(self)} records")
+            raise IndexError(f"record {index!r:.80} of a split with {len(self)} records")
         for _ in range(2):  # a stale file handle is not damage, so the shards are opened once more
             try:
                 reader = self._reader  # another thread may reset the attribute
@@ -155,8 +157,8 @@ class Store:
             raise StoreError(f"{self.path / entry['name']}: cannot be read ({error}); {cure}") from error
 
     def _entry(self, split: str) -> dict[str, Any]:
-        if split not in self.manifest["splits"]:
-            raise StoreError(f"{self.path}: no split {split!r}; it has {', '.join(self.splits)}")
+        if not isinstance(split, str) or split not in self.manifest["splits"]:
+            raise StoreError(f"{self.path}: no split {split!r:.80}; it has {', '.join(self.splits)}")
         return self.manifest["splits"][split]
 
 

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
@@ -11,6 +11,7 @@ from jaxtyping import Float, Float32, Int, UInt8
 from rsjax.clip import Video
 from rsjax.config import Config, to_dict
 from rsjax.errors import UserError
+from rsjax.files import checked_path
 from rsjax.model_directory import Dtype, Part, save_directory
 from rsjax.models.base import Assets, WorldModel
 from rsjax.models.card import model_card
@@ -100,9 +101,9 @@ class TrainedModel:
         codec = self._codec()
         grid = self.config.grid
         codes = 2**self.config.tokenizer.code_bits
-        if not isinstance(tokens, Mapping):
+        if not isinstance(tokens, Mapping) or not all(isinstance(name, str) for name in tokens):
             raise ShapeError(f"tokens are {type(tokens).__name__}; expected a dict with rgb, or rgb and depth")
-        arrays = {name: _array(f"tokens {name!r}", x) for name, x in tokens.items()}
+        arrays = {name: as_array(f"tokens {name!r}", x) for name, x in tokens.items()}
         if not {"rgb"} <= arrays.keys() <= {"rgb", "depth"}:
             raise ShapeError(f"tokens are of {', '.join(arrays) or 'nothing'}; expected rgb, or rgb and depth")
         for name, x in arrays.items():
@@ -136,7 +137,11 @@ class TrainedModel:
             UserError: the directory holds something else, or a parameter is too large for ``float16``.
             FileError: the disk is full or cannot be written to.
         """
-        directory = Path(directory)
+        directory = checked_path(directory, "directory")
+        if dtype not in get_args(Dtype):
+            raise UserError(f"dtype is {dtype!r:.80}; choose {' or '.join(get_args(Dtype))}")
+        if not isinstance(card, str):
+            raise UserError(f"card is {type(card).__name__}; it is the text of README.md")
         settings = to_dict(self.config)
         if self.config.data is not None:  # the name of the store is enough; its path is this machine's
             settings["data"]["store"] = Path(self.config.data.store).name
@@ -154,16 +159,16 @@ class TrainedModel:
 
     def _actions(self, actions: Any, prompt: Video, lead: tuple[int | str, ...]) -> Float32[np.ndarray, "*B T A"]:
         """Checks and returns actions as float32; ``lead`` are the sizes of axes before T, "N" for any above 0."""
-        actions = _array("actions", actions)
+        actions = as_array("actions", actions)
         width = self.config.clips.action_dim
         past = prompt.rgb.shape[1]
         expected = ", ".join(map(str, (*lead, "T", width)))
         fits = actions.ndim == len(lead) + 2 and actions.shape[-1] == width and actions.shape[-2] > past
         if not fits or (lead and (not len(actions) if lead == ("N",) else len(actions) != lead[0])):
             raise ShapeError(f"actions have shape {actions.shape}; expected ({expected}) with T above {past}")
-        if actions.dtype.kind not in "fiu" or not np.isfinite(actions).all():
+        if actions.dtype.kind not in "fiu" or not np.isfinite(_float32(actions)).all():
             raise ShapeError(f"actions are {actions.dtype} with values that are not finite numbers; expected floats")
-        return actions.astype(np.float32)
+        return _float32(actions)
 
     def _prompt(self, frames: Any, depth: Any, task: str | Sequence[str] | None) -> tuple[Video, bool]:
         """Returns :meth:`_video` with the clips' tasks."""
@@ -180,7 +185,7 @@ class TrainedModel:
 
     def _video(self, frames: Any, depth: Any) -> tuple[Video, bool]:
         """Checks and returns the arguments with a leading axis over clips, and whether that axis was added."""
-        frames = _array("frames", frames)
+        frames = as_array("frames", frames)
         size = self.config.clips.image_size
         if (
             not frames.size
@@ -195,17 +200,37 @@ class TrainedModel:
         single = frames.ndim == 4
         if depth is None:
             return Video(frames[None] if single else frames), single
-        depth = _array("depth", depth)
+        depth = as_array("depth", depth)
         if depth.shape != frames.shape[:-1] or depth.dtype.kind not in "fiu":
             raise ShapeError(
                 f"depth has shape {depth.shape} and type {depth.dtype}; expected {frames.shape[:-1]}, that of the "
                 f"frames, floats"
             )
-        depth = depth.astype(np.float32)
+        if not is_depth(depth):
+            raise ShapeError(f"depth is {_extent(depth)}; expected metres, 0 or more, or NaN where it is unknown")
+        depth = _float32(depth)
         return (Video(frames[None], depth[None]) if single else Video(frames, depth)), single
 
 
-def _array(name: str, value: Any) -> np.ndarray:
+def is_depth(depth: Float[np.ndarray, "*B H W"]) -> bool:
+    """Returns whether numbers can be z-depth in metres: finite and not negative; NaN is unknown."""
+    return not (depth < 0).any() and not np.isinf(_float32(depth)).any()
+
+
+def _float32(x: np.ndarray) -> Float32[np.ndarray, "*N"]:
+    """Returns numbers as float32; those beyond its range become infinite."""
+    with np.errstate(over="ignore"):
+        return x.astype(np.float32)
+
+
+def as_array(name: str, value: Any) -> np.ndarray:
+    """Returns an argument as an array.
+
+    Raises:
+        ShapeError: it is no array, or one with masked numbers.
+    """
+    if isinstance(value, np.ma.MaskedArray) and value.mask.any():
+        raise ShapeError(f"{name} are masked, and a model cannot leave numbers out; fill them or pass other ones")
     try:
         return np.asarray(value)
     except (ValueError, TypeError) as error:  # lists of other lengths, or what has no length

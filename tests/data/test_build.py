@@ -108,6 +108,14 @@ WRONG = [
     ({"fps": "5Hz"}, "fps is '5Hz'; it is frames per second, above 0"),
     ({"fps": -5}, "fps is -5; it is"),
     ({"fps": float("nan")}, "fps is nan; it is"),
+    ({"fps": True}, "fps is True; it is"),
+    ({"fps": 10**400}, "fps is 1000.*; it is frames per second, above 0 and at most 10000"),
+    ({"rgb": [[1], [1, 2]]}, "rgb cannot be made an array"),
+    ({"success": [[1], [1, 2]]}, "success cannot be made an array"),
+    ({"task": 3}, "task is 3; it is text"),
+    ({"skill": np.zeros(2)}, "skill is array.*; it is text"),
+    ({"episode": [1]}, r"episode is \[1\]; it is a name, or a number"),
+    ({"provenance": {"seed": 10**400}}, "provenance is no dict of JSON-ready values"),
     ({"provenance": {"seed": np.int64(3)}}, "provenance is no dict of JSON-ready values .*int64"),
     ({"provenance": "x"}, r"provenance is no dict of JSON-ready values \(it is a str\)"),
     (
@@ -140,6 +148,7 @@ def test_what_is_no_store_is_not_replaced_and_the_callers_errors_stay_its_own(tm
         ("mine", [clip()], 0.1, "mine: exists and is not a store"),
         ("none", [], 0.1, "there are no clips to write"),
         ("none", [clip()], 1, "test_share is 1"),
+        ("none", np.array(3.0), 0.1, "clips are array.*; give an iterable of clips"),
         ("none", wrong, 0.1, "^clip 1: is a list, should be a dict with rgb and actions$"),
     ):
         with pytest.raises(StoreError, match=message):

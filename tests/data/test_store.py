@@ -200,6 +200,21 @@ def test_only_what_holds_shards_is_to_be_deleted(path: Path, tmp_path: Path, man
         assert f"{theirs}: no store (it has no manifest.json)" in str(caught.value)
 
 
+def test_what_is_no_split_and_no_number_of_a_record_is_refused(path: Path) -> None:
+    store = open_store(path)
+    for split in (None, 3, ["train"], "val"):
+        with pytest.raises(StoreError) as raised:
+            store.source(split)  # type: ignore[arg-type]
+        assert "no split" in str(raised.value)
+    source = store.source(store.splits[0])
+    for number in (None, 1.5, "0", True, [0]):
+        with pytest.raises(StoreError) as raised:
+            source[number]  # type: ignore[index]
+        assert "records are numbered from 0" in str(raised.value)
+    with pytest.raises(IndexError):
+        source[10**400]
+
+
 def test_a_place_that_is_none_is_reported(tmp_path: Path) -> None:
     (tmp_path / "video.mp4").touch()
     with pytest.raises(StoreError, match=f"{tmp_path}/nowhere: not there"):

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -190,6 +191,14 @@ WRONG: dict[str, tuple[Callable[[Any], Any], str]] = {
     "actions-short": (lambda m: m.generate(RGB[0], ACTIONS[0]), f"with T above {FRAMES}"),
     "actions-nan": (lambda m: m.generate(RGB[0, :1], NAN), "actions are float.*not finite.*; expected floats"),
     "actions-words": (lambda m: m.generate(RGB[0, :1], ACTIONS[0].astype(str)), "actions are <U.*; expected floats"),
+    "actions-huge": (lambda m: m.generate(RGB[0, :1], ACTIONS[0] * 0 + 1e300), "not finite"),
+    "actions-masked": (lambda m: m.generate(RGB[0, :1], np.ma.masked_all(ACTIONS[0].shape)), "actions are masked"),
+    "depth-negative": (
+        lambda m: m.generate(RGB[:, :1], ACTIONS, -1 - DEPTH[:, :1]),
+        "depth is from .*; expected metres",
+    ),
+    "depth-huge": (lambda m: m.generate(RGB[:, :1], ACTIONS, DEPTH[:, :1] * 0 + 1e300), "expected metres, 0 or more"),
+    "decode-keys": (lambda m: m.decode({1: TOKENS}), "tokens are dict"),
     "depth-of-one-clip": (
         lambda m: m.generate(RGB[:, :1], ACTIONS, DEPTH[0, :1]),
         rf"depth has shape \(1, {SIZE}, {SIZE}\).*; expected \(2, 1, {SIZE}, {SIZE}\), that of the frames",
@@ -233,6 +242,21 @@ def test_a_wrong_argument_is_named_with_what_was_expected(case: str, model: Trai
     use, words = WRONG[case]
     with pytest.raises(ShapeError, match=words):
         use(model)
+
+
+def test_a_wrong_argument_of_save_is_named(model: TrainedModel, tmp_path: Path) -> None:
+    place = tmp_path / "saved"
+    wrong: dict[str, dict[str, Any]] = {
+        "directory is None": {"directory": None},
+        "dtype is None; choose float32 or float16": {"directory": place, "dtype": None},
+        "dtype is 'int32'": {"directory": place, "dtype": "int32"},
+        "card is bytes": {"directory": place, "card": b"x"},
+    }
+    for message, arguments in wrong.items():
+        with pytest.raises(UserError) as raised:
+            model.save(**arguments)
+        assert message in str(raised.value)
+    assert not place.exists()
 
 
 def test_a_family_without_tokens_encodes_nothing(model: TrainedModel) -> None:

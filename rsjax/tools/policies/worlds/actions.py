@@ -10,6 +10,7 @@ from rsjax.config import Config
 from rsjax.config.model import ModelConfig
 from rsjax.data.normalization import Normalization
 from rsjax.errors import UserError
+from rsjax.models.trained import ShapeError, as_array
 
 OutOfRange: TypeAlias = Literal["clip", "refuse"]
 SPREAD = 5.0  # actions of recordings are clipped to this many standard deviations around the mean
@@ -71,12 +72,15 @@ class ActionRange:
             shape = self.low.shape
         else:
             shape = (count, *self.low.shape)
+        wanted = f"expected floats of shape {shape}, {self.unit}"
         try:
-            numbers = np.asarray(actions, np.float32)
-        except (TypeError, ValueError) as error:
-            raise ActionError(
-                f"an action is {type(actions).__name__}; expected floats of shape {shape}, {self.unit}"
-            ) from error
+            numbers = as_array("actions", actions)
+        except ShapeError as error:
+            raise ActionError(f"{error}; {wanted}") from error
+        if numbers.dtype.kind not in "fiu":
+            raise ActionError(f"an action is {type(actions).__name__} of {numbers.dtype}; {wanted}")
+        with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, which is refused below
+            numbers = numbers.astype(np.float32)
         if numbers.shape != shape:
             raise ActionError(f"actions have shape {numbers.shape}; expected {shape}, {self.unit}")
         if ignored is not None:

@@ -15,6 +15,7 @@ from rsjax.config import Config
 from rsjax.data.clips import readable
 from rsjax.data.store import Source, StoreError
 from rsjax.errors import UserError
+from rsjax.models.trained import as_array, is_depth
 from rsjax.tools.pipeline.run import Run
 from rsjax.tools.pipeline.run_clips import relocated
 from rsjax.tools.policies.worlds.model_world import FirstFrame
@@ -87,7 +88,7 @@ class Starts:
             names = ", ".join(sorted(map(str, unknown)))
             raise StartError(f"reset has no option {names:.80} (options: rgb, depth, clip, draw)")
         draw = options.get("draw", 0)
-        if not isinstance(draw, int | np.integer) or not 0 <= draw < MOST_DRAWS:
+        if not _is_whole(draw) or not 0 <= draw < MOST_DRAWS:
             raise StartError(f"the option draw is {draw!r:.80}; it is a whole number from 0 to {MOST_DRAWS - 1}")
         number = -1
         if "rgb" in options or "depth" in options:
@@ -110,7 +111,7 @@ class Starts:
                 if not self.depth or clip["depth"] is not None:
                     return chosen, clip
             raise StartError(f"no clip of the {self.split} split has depth, which this model starts from")
-        if not isinstance(number, int | np.integer) or not 0 <= number < count:
+        if not _is_whole(number) or not 0 <= number < count:
             raise StartError(f"no clip {number!r:.80} in the {self.split} split, which has 0 … {count - 1}")
         clip = self.source[int(number)]
         if self.depth and clip["depth"] is None:
@@ -120,7 +121,7 @@ class Starts:
     def _checked(self, options: dict[str, Any]) -> tuple[np.ndarray, np.ndarray | None]:
         """Returns the caller's frame and its depth."""
         size = self.config.clips.image_size
-        rgb = _array(options.get("rgb"))
+        rgb = as_array("the first frame's rgb", options.get("rgb"))
         if rgb.shape != (size, size, 3) or rgb.dtype != np.uint8:
             raise StartError(
                 f"the first frame's rgb has shape {rgb.shape} and type {rgb.dtype}; expected ({size}, {size}, 3), "
@@ -128,18 +129,16 @@ class Starts:
             )
         if not self.depth:
             return rgb, None
-        depth = _array(options.get("depth"))
-        if depth.shape != (size, size) or depth.dtype.kind not in "fiu" or not np.isfinite(depth).all():
+        depth = as_array("the first frame's depth", options.get("depth"))
+        fits = depth.shape == (size, size) and depth.dtype.kind in "fiu"
+        if not fits or not is_depth(depth) or np.isnan(depth).any():
             raise StartError(
                 f"the first frame's depth has shape {depth.shape} and type {depth.dtype}; this model generates depth, "
-                f"so it starts from finite floats of shape ({size}, {size}), metres along the optical axis"
+                f"so it starts from finite floats of shape ({size}, {size}), 0 or more, metres along the optical axis"
             )
         return rgb, depth.astype(np.float32)
 
 
-def _array(value: Any) -> np.ndarray:
-    """Returns an array; an empty one for lists of other lengths, which the caller refuses by its shape."""
-    try:
-        return np.asarray(value)
-    except ValueError:
-        return np.zeros(0)
+def _is_whole(value: Any) -> bool:
+    """Returns whether a value is a whole number; True and False are none."""
+    return isinstance(value, int | np.integer) and not isinstance(value, bool)

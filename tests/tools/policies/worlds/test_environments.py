@@ -192,14 +192,20 @@ def test_junk_is_refused_at_one_border(env: WorldModelEnv, model: TrainedModel, 
             if each is env or wrong != []:
                 with pytest.raises(UserError):
                     each.reset(seed=wrong)
+    with pytest.raises(UserError):
+        several.reset(seed=np.array(3.0))
     with pytest.raises(UserError) as raised:
         several.reset(seed=[1, 2, 3])
     assert "3 seeds for 2" in str(raised.value)
     options: tuple[Any, ...] = (7, "x", [1], {7: 1}, {"rgb": [[1], [1, 2]]})
-    for option in (*options, *({"draw": wrong} for wrong in JUNK if wrong is not True)):
+    for option in (*options, {"clip": True}, *({"draw": wrong} for wrong in JUNK)):
         for each in (env, several):
-            with pytest.raises(StartError):
+            with pytest.raises(UserError):
                 each.reset(seed=0, options=option)
+    several.reset(seed=0)
+    for action in (*JUNK, np.zeros((2, 28), bool), np.zeros((2, 28), complex), np.full((2, 28), "0"), [[1], [1, 2]]):
+        with pytest.raises(ActionError):
+            several.step(action)
 
 
 @pytest.mark.filterwarnings("ignore:os.fork")
