@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 class ClipShape:
     """Shape of a data set's clips: frames, pixels per side, tracks N₀, numbers in a frame's action; test clips."""
 
-    frames: int
-    image_size: int
-    tracks: int
-    action_dim: int
-    test_clips: int
+    frames: int  # of a clip
+    image_size: int  # pixels a side
+    tracks: int  # N₀, of each clip
+    action_dim: int  # numbers in a frame's action
+    test_clips: int  # clips of the test split
 
 
 @dataclass(frozen=True)
@@ -23,11 +23,11 @@ class DataConfig:
 
     store: str = field(metadata={"runtime": True})  # its path
     key: str  # its content key, which identifies it wherever it is
-    frames: int
-    image_size: int
-    tracks: int
-    action_dim: int
-    test_clips: int
+    frames: int  # of a clip; the store's, as are the four that follow
+    image_size: int  # pixels a side
+    tracks: int  # N₀, of each clip
+    action_dim: int  # numbers in a frame's action
+    test_clips: int  # clips of the test split
 
     @property
     def clips(self) -> ClipShape:

@@ -92,16 +92,17 @@ class Config:
     token grid that follows from them and the tokenizer.
     """
 
-    name: str
+    name: str  # of the preset; by default also that of the run's directory
     prompt_frames: int = 1  # frames that generation starts from; 1 in the paper
     sim: SimConfig = SimConfig()  # ignored if data names a store
     data: DataConfig | None = None  # a store of clips instead of simulated episodes; --store sets it
     tokenizer: TokenizerConfig = TokenizerConfig()  # ignored by a model without tokens or with its own autoencoder
+    # The training of the tokenizer, or of the model's own autoencoder.
     tokenizer_train: TokenizerTrainConfig = TokenizerTrainConfig()
-    model: ModelConfig = RoboScapeConfig()
-    train: TrainConfig = TrainConfig()
-    runtime: RuntimeConfig = RuntimeConfig()
-    eval: EvalConfig = EvalConfig()
+    model: ModelConfig = RoboScapeConfig()  # of the family that the preset or --model chooses
+    train: TrainConfig = TrainConfig()  # the training of the world model
+    runtime: RuntimeConfig = RuntimeConfig()  # of both trainings; changes no result
+    eval: EvalConfig = EvalConfig()  # the evaluation on the test split, after training
 
     def __post_init__(self) -> None:
         check_numbers(self)

@@ -38,7 +38,7 @@ class SimConfig:
     # objects: up to half on a grid, the others on the objects and the arm's moving links, found by segmentation.
     track_points: Literal["grid", "objects"] = "grid"
     seed: int = 0  # of the scenes and the motions
-    env: Literal["lift", "metaworld"] = "lift"
+    env: Literal["lift", "metaworld"] = "lift"  # lift: one cube to lift; metaworld: up to 50 tasks
     tasks: tuple[str, ...] = ()  # of Meta-World; none: the 45 training tasks of its ML45 benchmark
     unseen_tasks: tuple[str, ...] = ()  # for the protocol "unseen"; none: the 5 tasks that ML45 holds out
     # What the training episodes show, each with its share: expert, grasps, pushes, slips, driving, novices, or

@@ -43,9 +43,9 @@ class StateHeadsConfig:
     weighs the loss NAME; 0 switches it off.
     """
 
-    success_weight: float = 1.0
-    height_weight: float = 1.0
-    opening_weight: float = 1.0
+    success_weight: float = 1.0  # of the cross-entropy of success
+    height_weight: float = 1.0  # of the error of the object's height
+    opening_weight: float = 1.0  # of the error of the gripper's opening
 
     def __post_init__(self) -> None:
         names = ("success_weight", "height_weight", "opening_weight")
@@ -99,7 +99,7 @@ class Departures:
     # the model's own prediction of the frame before (its mean codes), as in a rollout. Such a step takes a third more
     # work.
     self_conditioning: float = 0.0
-    self_conditioning_after: int = 0
+    self_conditioning_after: int = 0  # steps; later where the model's own predictions are useless at first
 
     # The keypoint terms.
     # The anchor of Eq. 5 is the code of the true first frame, not ŝ₁, the output at frame 1: this is the prompt, which
@@ -156,7 +156,7 @@ class SampleConfig:
     # again from position 0. A smaller stride gives a longer memory and more work. 0: half of the positions.
     window_stride: int = 0
     cache_dtype: Literal["float32", "bfloat16"] = "float32"  # of temporal keys and values; bfloat16 halves the memory
-    seed: int = 0
+    seed: int = 0  # of the draws; another one gives other videos of the same clips
 
     def __post_init__(self) -> None:
         require(self.steps >= 1, f"model.sample.steps is {self.steps}; a frame needs at least 1 decoding step")
@@ -234,7 +234,7 @@ class TransformerConfig:
     # What the backward pass recomputes. none: nothing. blocks: everything but each block's inputs and a depth block's
     # output. products: the same, but linear layers' outputs are kept too (less work, more memory).
     remat: Literal["none", "products", "blocks"] = runtime("none")
-    public_code: PublicCodeConfig | None = None
+    public_code: PublicCodeConfig | None = None  # on only for published weights
     departures: Departures = Departures()  # what the paper does not have
 
     def __post_init__(self) -> None:
@@ -282,8 +282,8 @@ class TokenModelConfig(TransformerConfig, ModelConfig):
     uses_tokenizer: ClassVar[bool] = True
     max_frames: int = 0
     corruption: CorruptionConfig | None = CorruptionConfig()  # off: models of few steps lose more than they gain
-    state_heads: StateHeadsConfig | None = None
-    sample: SampleConfig = sampling(SampleConfig())
+    state_heads: StateHeadsConfig | None = None  # on where a model is to judge success itself
+    sample: SampleConfig = sampling(SampleConfig())  # how frames are generated; may change after training
 
     @property
     def takes_actions(self) -> bool:
@@ -435,7 +435,7 @@ class GenieConfig(TokenModelConfig):
     With ``action_encoder`` "mlp" it is the paper's baseline, with "none" the public model.
     """
 
-    action_encoder: ActionEncoder = "mlp"
+    action_encoder: ActionEncoder = "mlp"  # none: the public model without actions
 
     @property
     def loss_weights(self) -> dict[str, float]:

@@ -90,7 +90,7 @@ class TokenizerConfig:
 class PerceptualConfig:
     """The LPIPS term, as in the reference."""
 
-    weight: float = 1.0
+    weight: float = 1.0  # of the term; 1 as in the reference
     # A safetensors file of rsjax convert lpips; empty: the term is skipped, with a note.
     lpips: str = ""
 

@@ -16,7 +16,7 @@ class ScheduleConfig:
     # cosine and linear decay from the peak to final_share of it; wsd (warm-up, stable, decay) decays only in the last
     # fifth of the run.
     schedule: Literal["cosine", "linear", "wsd"] = "cosine"
-    final_share: float = 0.05
+    final_share: float = 0.05  # of the peak, at the end; 0 anneals to nothing
 
     def __post_init__(self) -> None:
         require_range(self, "optimizer", 0, math.inf, "learning_rate", "warmup_steps")
@@ -32,7 +32,7 @@ class AdamW(ScheduleConfig):
     # The public Genie uses linear. steps divides the peak by 10 at each share of the run in drop_at; without any it
     # stays constant.
     schedule: Literal["cosine", "linear", "wsd", "steps"] = "cosine"  # type: ignore[assignment]
-    drop_at: tuple[float, ...] = ()
+    drop_at: tuple[float, ...] = ()  # with steps: shares of the run, such as 0.5 0.75
     betas: tuple[float, float] = (0.9, 0.95)  # decay of the averages of gradients and of their squares
     weight_decay: float = 0.0  # decoupled from the gradient; against overfitting in many epochs
     grad_clip: float = 1.0  # 0: none
@@ -76,7 +76,7 @@ class ComponentConfig:
     ``scenes`` match.
     """
 
-    tasks: tuple[str, ...] = ("*",)
+    tasks: tuple[str, ...] = ("*",)  # of the clips, in words
     difficulties: tuple[str, ...] = ("*",)  # labels of the store, such as simple and difficult
     scenes: tuple[str, ...] = ("*",)  # likewise, such as kitchen
     store: str = ""  # a token store of the same tokenizer; empty: this run's own
@@ -104,6 +104,7 @@ class CurriculumStageConfig:
     learning rate.
     """
 
+    # The mixture that this stage draws from; one of all clips by default.
     components: tuple[ComponentConfig, ...] = (ComponentConfig(),)
     epochs: float = 1.0  # the stage draws this many times the number of its components' clips
     # The learning rate schedule starts again with this stage; it ends at the next restart or the end of the run.
@@ -125,7 +126,7 @@ class TrainConfig:
 
     steps: int = 1000  # ignored with a curriculum
     batch_size: int = 8  # clips of a step, over all devices
-    optimizer: AdamW | Muon = AdamW()
+    optimizer: AdamW | Muon = AdamW()  # muon learns more in few steps (see Muon)
     ema: float = 0.0  # decay of the averaged weights that later stages use; 0: no averaging
     seed: int = 0  # of the initial weights and of all draws; compare results over several
     # A run directory, or one made by rsjax convert, whose weights training starts from. With it, steps

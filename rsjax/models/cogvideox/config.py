@@ -22,12 +22,12 @@ class CausalVAEConfig:
     It learns from ``frames_per_clip`` consecutive frames of a clip.
     """
 
-    latent_channels: int = 16
+    latent_channels: int = 16  # of a cell; fewer are easier to predict, and coarser
     patch_size: int = 1  # space-to-depth before the first convolution; 1 as in the public network, larger is cheaper
     # One for each level. Every level but the last halves the grid, the first two halve time too.
     widths: tuple[int, ...] = (128, 256, 256, 512)
     res_blocks: int = 3  # of a level in the encoder; the decoder has one more
-    norm_groups: int = 32
+    norm_groups: int = 32  # of each group norm; smaller where it has to divide fewer channels
     kl_weight: float = 1e-4  # of the mean divergence of a latent number from the normal distribution
     # The image that the model continues is a clip's first frame with noise of a deviation of exp(N(mean, deviation²)),
     # pixels being in ±1. This many noisy images are encoded for each clip; 0: the frame as it is.
@@ -71,8 +71,8 @@ class TextConfig:
     """How the model knows a clip's task: embeddings of its words from a file, or learned tokens."""
 
     file: str = ""  # embeddings of the tasks, made by rsjax convert text; empty: learned tokens
-    tokens: int = 226
-    width: int = 4096
+    tokens: int = 226  # of each text; those of the file, if there is one
+    width: int = 4096  # numbers of a token; 4096 in T5-XXL
     tasks: tuple[str, ...] = ()  # tasks with learned tokens of their own; empty: all clips share the same tokens
     dropout: float = 0.1  # share of the training clips that see the empty text
 
@@ -89,9 +89,10 @@ class TextConfig:
 class GuidedDenoiseConfig(DenoiseConfig):
     """Settings of the sampler with classifier-free guidance."""
 
-    sampler: Literal["pndm", "ddim"] = "ddim"
+    sampler: Literal["pndm", "ddim"] = "ddim"  # ddim: one network call a step
+    # Trailing begins at the noisiest step, as zero_terminal needs.
     spacing: Literal["linspace", "leading", "trailing"] = "trailing"
-    end_clean: bool = True
+    end_clean: bool = True  # as in the public sampler
     # g in v = without + g·(with - without the text). 1: no guidance; other values double the work.
     guidance: float = 6.0
 
@@ -102,20 +103,20 @@ class CogVideoXConfig(ModelConfig):
     """CogVideoX: full attention over text and a clip's latents, v-prediction; the defaults are 5B-I2V. No actions."""
 
     uses_tokenizer: ClassVar[bool] = True
-    autoencoder: CausalVAEConfig = CausalVAEConfig()
-    text: TextConfig = TextConfig()
-    width: int = 3072
-    blocks: int = 42
-    heads: int = 48
-    mlp_ratio: int = 4
+    autoencoder: CausalVAEConfig = CausalVAEConfig()  # trained first, or converted
+    text: TextConfig = TextConfig()  # how the model knows the task
+    width: int = 3072  # channels of the transformer
+    blocks: int = 42  # of the transformer
+    heads: int = 48  # of each attention; the width is theirs together
+    mlp_ratio: int = 4  # width of an MLP's hidden layer, in widths of the model
     patch_size: int = 2  # cells of latents that one token covers, along each side
-    time_width: int = 512
+    time_width: int = 512  # channels of the embedding of the noise's step
     # How the model sees the image. channels: the image's latents are further channels of the first frame; those of
     # later frames are zeros. first_latent: the image is the first latent frame, without noise and not in the loss. The
     # public 2B sees no image and has no such channels.
     image: Literal["channels", "first_latent"] = "channels"
     image_dropout: float = 0.0  # share of the training clips without an image in its channels
-    positions: Literal["rotary", "sincos"] = "rotary"
+    positions: Literal["rotary", "sincos"] = "rotary"  # rotary in 5B, sincos in 2B
     position_scale: float = 1.875  # sincos: rows and columns are divided by it
     # rotary: rows and columns over which positions are stretched, 30 and 45 in the public sampler. Empty: they count
     # 0, 1, 2 …, as in the public fine-tuner. Both are the same at 480×720 pixels.
@@ -125,11 +126,12 @@ class CogVideoXConfig(ModelConfig):
     compute_dtype: Literal["float32", "bfloat16"] = "float32"  # bfloat16: operands of linear layers and attention
     unroll: int = runtime(1)  # blocks per iteration of the scan; more are faster on a CPU and compile longer
     remat: Literal["none", "blocks"] = runtime("none")  # blocks: the backward pass keeps only the blocks' inputs
-    error_weight: float = 1.0
+    error_weight: float = 1.0  # of the squared error, the only term
+    # The forward process.
     noise: NoiseConfig = NoiseConfig(
         beta_start=0.00085, beta_end=0.012, betas="scaled_linear", prediction="velocity", zero_terminal=True
     )
-    sample: GuidedDenoiseConfig = sampling(GuidedDenoiseConfig())
+    sample: GuidedDenoiseConfig = sampling(GuidedDenoiseConfig())  # how clips are generated; may change after training
 
     def __post_init__(self) -> None:
         sizes = ("width", "blocks", "heads", "mlp_ratio", "patch_size", "time_width", "unroll")

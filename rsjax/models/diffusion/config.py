@@ -12,11 +12,11 @@ from rsjax.config.fields import fitting_sizes, require, require_range
 class NoiseConfig:
     """The forward process: how latents turn into noise, and which quantity the network predicts."""
 
-    steps: int = 1000
-    beta_start: float = 1e-4
-    beta_end: float = 0.02
+    steps: int = 1000  # of the forward process; sampling visits some of them
+    beta_start: float = 1e-4  # variance that the first step adds
+    beta_end: float = 0.02  # variance that the last step adds
     betas: Literal["linear", "scaled_linear"] = "linear"  # scaled_linear: their roots grow linearly
-    prediction: Literal["noise", "velocity"] = "noise"
+    prediction: Literal["noise", "velocity"] = "noise"  # velocity: a mixture of noise and latents
     snr_shift: float = 1.0  # s in ᾱ ← ᾱ / (s + (1 - s)·ᾱ): the ratio of signal to noise is divided by it
     zero_terminal: bool = False  # √ᾱ is rescaled to be 0 after the last step, where sampling then begins
 
@@ -40,13 +40,13 @@ class DenoiseConfig:
 
     # ddim: one network call a step. pndm: begins with Runge-Kutta steps, so it takes steps + 9 calls.
     sampler: Literal["pndm", "ddim"] = "pndm"
-    steps: int = 50
+    steps: int = 50  # fewer are faster and coarser
     # Which steps of the forward process are visited: from 0 to the last (linspace), multiples of one number from 0 on
     # (leading), or an evenly spaced series that ends with the last one (trailing).
     spacing: Literal["linspace", "leading", "trailing"] = "linspace"
     # ᾱ after the last step is 1; False: that of the first step of the forward process. The public IRASim has False.
     end_clean: bool = False
-    seed: int = 0
+    seed: int = 0  # of the noise; another one gives other videos of the same clips
 
     def __post_init__(self) -> None:
         least = 4 if self.sampler == "pndm" else 1

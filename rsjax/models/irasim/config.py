@@ -24,10 +24,10 @@ class DiTConfig:
     final_frame_ada: bool = False  # frame: actions modulate the last layer, too; the published weights lack it
     learn_sigma: bool = False  # outputs variances beside the noise; they are neither trained nor read
     integrate_actions: bool = False  # also the sum of all actions so far; see TransformerConfig
-    width: int = 1152
+    width: int = 1152  # channels of the transformer
     blocks: int = 28  # half of them within frames, half over time
-    heads: int = 16
-    mlp_ratio: int = 4
+    heads: int = 16  # of each attention; the width is theirs together
+    mlp_ratio: int = 4  # width of an MLP's hidden layer, in widths of the model
     patch_size: int = 2  # cells of latents that one token covers, along each side
     compute_dtype: Literal["float32", "bfloat16"] = "float32"  # bfloat16: operands of linear layers and attention
     unroll: int = runtime(1)  # pairs of blocks per iteration of the scan; more are faster on a CPU and compile longer
@@ -60,11 +60,11 @@ class KLConfig:
 
     # sdxl: that of Stable Diffusion XL. magvit2: the tokenizer's convolutions, without a quantiser.
     network: Literal["sdxl", "magvit2"] = "sdxl"
-    latent_channels: int = 4
-    channels: int = 128
+    latent_channels: int = 4  # of a cell; fewer are easier to predict, and coarser
+    channels: int = 128  # of the first level; times its multiplier, of each other one
     channel_multipliers: tuple[int, ...] = (1, 2, 4, 4)  # one per level; every level but the last halves the grid
-    res_blocks: int = 2
-    norm_groups: int = 32
+    res_blocks: int = 2  # of each level
+    norm_groups: int = 32  # of each group norm; smaller where it has to divide fewer channels
     patch_size: int = 1  # magvit2: space-to-depth before the first convolution
     local_codes: bool = False  # magvit2: a cell's latents depend on its own pixels alone
     kl_weight: float = 1e-4  # of the mean divergence of a latent number from the normal distribution
@@ -111,11 +111,11 @@ class IRASimConfig(DiTConfig, ModelConfig):
     """IRASim (reference: its authors' public code): predicts the noise in a clip's latents; first frames are clean."""
 
     uses_tokenizer: ClassVar[bool] = True
-    autoencoder: KLConfig = KLConfig()
+    autoencoder: KLConfig = KLConfig()  # trained first, or converted
     action_dropout: float = 0.1  # share of the training clips whose actions are replaced by a learned embedding
-    error_weight: float = 1.0
-    noise: NoiseConfig = NoiseConfig()
-    sample: DenoiseConfig = sampling(DenoiseConfig())
+    error_weight: float = 1.0  # of the squared error, the only term
+    noise: NoiseConfig = NoiseConfig()  # the forward process
+    sample: DenoiseConfig = sampling(DenoiseConfig())  # how clips are generated; may change after training
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -16,16 +16,16 @@ class ConditionalVQConfig:
     patch_size: int = 1  # space-to-depth before the first convolution; 1 as in the public network, larger is cheaper
     widths: tuple[int, ...] = (128, 256, 512)  # one per level; every level but the last halves the grid
     res_blocks: int = 2  # of a level in the encoder; the decoder has one more
-    norm_groups: int = 32
-    latent: int = 64
+    norm_groups: int = 32  # of each group norm; smaller where it has to divide fewer channels
+    latent: int = 64  # numbers of a code
     codes: int = 8192  # in each of the two codebooks
     future_patch: int = 4  # a later frame's token covers this many cells along each side
     attention_size: int = 16  # levels of at most this many cells a side attend to the context
-    heads: int = 4
+    heads: int = 4  # of the attention to the context
     dropout: float = 0.1  # of weights and output of the attention to the context
     # Codes are initialised between ± this; 0: ± 1/codes, as in the public code, but a short training moves few of them.
     codebook_scale: float = 0.0
-    codebook_weight: float = 1.0
+    codebook_weight: float = 1.0  # of the term that pulls codes towards the encoder's output
     compute_dtype: Literal["float32", "bfloat16"] = "float32"  # of the operands of 3×3 convolutions
 
     def __post_init__(self) -> None:
@@ -76,7 +76,7 @@ class TopKConfig:
     temperature: float = 1.0  # logits are divided by it; 0 takes the most probable token
     top_k: int = 100  # draw from the k most probable tokens; 0: from all
     cache_dtype: Literal["float32", "bfloat16"] = "float32"  # of keys and values
-    seed: int = 0
+    seed: int = 0  # of the draws; another one gives other videos of the same clips
 
     def __post_init__(self) -> None:
         require_range(self, "model.sample", 0, float("inf"), "temperature", "top_k")
@@ -88,11 +88,11 @@ class IVideoGPTConfig(ModelConfig):
     """A LLaMA on the tokens of :class:`ConditionalVQConfig`; the defaults are the public network."""
 
     uses_tokenizer: ClassVar[bool] = True
-    autoencoder: ConditionalVQConfig = ConditionalVQConfig()
-    width: int = 768
-    blocks: int = 12
-    heads: int = 12
-    mlp_width: int = 3072
+    autoencoder: ConditionalVQConfig = ConditionalVQConfig()  # trained first, or converted
+    width: int = 768  # channels of the LLaMA
+    blocks: int = 12  # of the LLaMA
+    heads: int = 12  # of each attention; the width is theirs together
+    mlp_width: int = 3072  # of an MLP's hidden layer
     # Tokens in one sequence. A longer rollout takes its last frames as the context of a new sequence.
     positions: int = 1024
     use_actions: bool = True  # False: the public action-free models
@@ -101,7 +101,7 @@ class IVideoGPTConfig(ModelConfig):
     compute_dtype: Literal["float32", "bfloat16"] = "float32"  # bfloat16: operands of linear layers and attention
     unroll: int = runtime(1)  # blocks per iteration of the scan
     remat: Literal["none", "blocks"] = runtime("none")  # blocks: the backward pass keeps only the blocks' inputs
-    sample: TopKConfig = sampling(TopKConfig())
+    sample: TopKConfig = sampling(TopKConfig())  # how tokens are drawn; may change after training
 
     def __post_init__(self) -> None:
         require_range(self, "model", 1, float("inf"), "width", "blocks", "heads", "mlp_width", "positions", "unroll")

@@ -56,15 +56,15 @@ _UNEVEN = 1e-3  # seconds by which frame intervals may differ from the frame rat
 class ClipConfig:
     """How clips are cut."""
 
-    windows: WindowConfig = field(default_factory=WindowConfig)
+    windows: WindowConfig = field(default_factory=WindowConfig)  # which frames make a clip
     image_size: int = 64  # pixels
     tracks: int = 256  # N₀
     camera: str = ""  # "": the episode's first
     fit: Fit = "crop"  # how pictures that are not square become squares
     recorded_depth: bool = True  # use the data set's own depth
     most_holes: float = 0.5  # share of a recorded depth map; holes are filled from the nearest measured pixel
-    actions: ActionConfig = field(default_factory=ActionConfig)
-    categories: CategoryConfig = field(default_factory=CategoryConfig)
+    actions: ActionConfig = field(default_factory=ActionConfig)  # how recorded actions become those of clips
+    categories: CategoryConfig = field(default_factory=CategoryConfig)  # words for difficulties and scenes
 
     def __post_init__(self) -> None:
         require(8 <= self.image_size <= 4096, f"--image-size is {self.image_size}; choose one from 8 to 4096")

@@ -30,7 +30,7 @@ class WindowConfig:
     Motion is ``rsjax.tools.ingest.annotators.protocols.Motion.high``, in pixels per second of a 256-pixel-wide picture.
     """
 
-    frames: int = 16
+    frames: int = 16  # of a window, which becomes a clip
     rate: float = 2.0  # frames per second of a window, by the time stamps; 0: each recorded frame
     hop: int = 1  # distance between the starts of successive windows, in frames of the window
     within_segments: bool = False  # each window in one segment of the data set; else only cuts between shots bound it

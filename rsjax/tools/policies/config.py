@@ -35,14 +35,15 @@ class PolicyConfig:
     noise_steps: int = 100  # of the diffusion
     sample_steps: int = runtime(100)  # of sampling, a divisor of noise_steps
     channels: tuple[int, ...] = (256, 512, 1024)  # of the U-Net's levels
-    kernel: int = 5
+    kernel: int = 5  # controls that a convolution of the U-Net spans
     groups: int = 8  # of the U-Net's group normalisation
-    step_embedding: int = 128
+    step_embedding: int = 128  # numbers that tell the U-Net the noise's step
     vision: tuple[int, ...] = (64, 128, 256, 512)  # channels of the ResNet's stages
     vision_blocks: int = 2  # of each stage
     pool: bool = True  # whether the ResNet's stem halves the picture a second time
     keypoints: int = 32  # of the spatial softmax
     features: int = 64  # of each frame
+    # Length, batch and optimizer of its training.
     train: LoopConfig = LoopConfig(
         steps=100_000, batch_size=64, optimizer=PUBLIC_OPTIMIZER, ema=0.9999, checkpoint_every=1000, log_every=100
     )
