@@ -411,7 +411,7 @@ def _seeds(seed: int | Sequence[int | None] | None, count: int) -> list[int | No
     """Returns the seed of each environment."""
     if seed is None:
         return [None] * count
-    if not isinstance(seed, Sequence | np.ndarray) or isinstance(seed, str) or np.ndim(seed) != 1:
+    if not isinstance(seed, Sequence | np.ndarray) or isinstance(seed, str) or getattr(seed, "ndim", 1) != 1:
         first = checked_seed(seed)
         assert first is not None
         return [first + number for number in range(count)]

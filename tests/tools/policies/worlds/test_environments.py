@@ -193,7 +193,7 @@ def test_junk_is_refused_at_one_border(env: WorldModelEnv, model: TrainedModel, 
                 with pytest.raises(UserError):
                     each.reset(seed=wrong)
     with pytest.raises(UserError):
-        several.reset(seed=np.array(3.0))
+        several.reset(seed=np.array(3.0))  # type: ignore[arg-type]
     with pytest.raises(UserError) as raised:
         several.reset(seed=[1, 2, 3])
     assert "3 seeds for 2" in str(raised.value)
