@@ -76,6 +76,18 @@ def generate_writes_videos() -> None:
 
 
 @step
+def a_tiny_lerobot_set_is_finetuned_on() -> None:
+    import rsjax as package
+
+    clips = [{"rgb": clip["rgb"], "actions": clip["actions"], "fps": 5.0} for clip in package.examples("tiny")]
+    package.write_store("clips", clips)
+    rsjax("export", "lerobot", "clips", "lerobot")
+    printed = rsjax("finetune", "tiny", "--data", "lerobot:lerobot", "--out", "runs/mine", "--steps", "20")
+    assert "the model's tokenizer" in printed and "repeating the first frame" in printed, printed
+    assert (Path("runs/mine") / "report.html").exists()
+
+
+@step
 def play_serves_the_page_and_a_frame_is_driven() -> None:
     from websockets.sync.client import connect
 

@@ -53,7 +53,12 @@ def write_curriculum(stages: tuple[CurriculumStageConfig, ...]) -> str:
     for stage in stages:
         components = [_changed(component) for component in stage.components]
         entry = components[0] if len(components) == 1 else {"components": components}
-        entries.append(entry | {"epochs": stage.epochs} | ({"restart": True} if stage.restart else {}))
+        entry = entry | {"epochs": stage.epochs}
+        if stage.restart:
+            entry["restart"] = True
+        if stage.frames:
+            entry["frames"] = stage.frames
+        entries.append(entry)
     return json.dumps(entries)
 
 

@@ -1,7 +1,7 @@
 """Settings of the training loop and its optimizer."""
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import ClassVar, Literal
 
 from rsjax.config.fields import later, require, require_range, runtime
@@ -109,13 +109,33 @@ class CurriculumStageConfig:
     epochs: float = 1.0  # the stage draws this many times the number of its components' clips
     # The learning rate schedule starts again with this stage; it ends at the next restart or the end of the run.
     restart: bool = False
+    # Train on this many of each clip's frames, the first ones, which is cheaper; 0: all. Only families of tokens.
+    frames: int = later(0)
 
     def __post_init__(self) -> None:
         require(self.epochs > 0, f"a curriculum's stage has {self.epochs} epochs; it must have more than 0")
         require(
+            self.frames == 0 or self.frames >= 2,
+            f"a curriculum's stage has {self.frames} frames; a clip has at least 2, and 0 means all of them",
+        )
+        require(
             bool(self.components),
             "a curriculum's stage has no components, so no data; leave components out for all of it",
         )
+
+
+@dataclass(frozen=True)
+class EarlyStopConfig:
+    """Ends a training that has stopped to improve on held-out clips; its weights are those of the best validation.
+
+    Held-out clips are the split "validation" of the run's store, or the split "test" if there is none.
+    """
+
+    every: int = 100  # steps between validations
+    patience: int = 3  # validations in a row without a new best one that end the training
+
+    def __post_init__(self) -> None:
+        require_range(self, "early_stop", 1, 2**31 - 1, "every", "patience")
 
 
 @dataclass(frozen=True)
@@ -135,6 +155,8 @@ class TrainConfig:
     # A curriculum, stage after stage, whose epochs determine the number of steps (``steps`` is ignored; commands refuse
     # a change of it). Empty: all clips of this run for ``steps`` steps. On the command line: a file of JSON.
     curriculum: tuple[CurriculumStageConfig, ...] = ()
+    # On: validates as it says, in place of runtime.eval_every, and uses the best weights, not the last ones.
+    early_stop: EarlyStopConfig | None = field(default=None, metadata={"later": True})
     accumulate: int = runtime(1)  # parts of a batch computed one after another; raise it where memory runs out
 
     def __post_init__(self) -> None:
@@ -192,6 +214,13 @@ class LoopConfig(RuntimeConfig, TrainConfig):
     keep_every: int = runtime(0)
     keep_best: bool = runtime(True)
 
+    @property
+    def validate_every(self) -> int:
+        """Steps between validations; 0: none."""
+        if self.early_stop is None:
+            return self.eval_every
+        return self.early_stop.every
+
     @classmethod
     def create(cls, train: TrainConfig, runtime: RuntimeConfig = RuntimeConfig()) -> "LoopConfig":
         """Joins the settings of a stage's training with those of the run."""
@@ -201,6 +230,10 @@ class LoopConfig(RuntimeConfig, TrainConfig):
         RuntimeConfig.__post_init__(self)
         TrainConfig.__post_init__(self)
         require_range(self, "loop", 1, math.inf, "keep_last")
+        require(
+            self.early_stop is None or self.keep_best,
+            "early_stop is on but keep_best is off, so that the best weights would be deleted; switch keep_best on",
+        )
         require_range(self, "loop", 0, math.inf, "skip_budget", "keep_every")
         require(
             list(self.restarts) == sorted(set(self.restarts)) and all(step > 0 for step in self.restarts),

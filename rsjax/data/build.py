@@ -85,12 +85,13 @@ def write_clips(path: Path | str, clips: Iterable[Mapping[str, Any] | Clip], tes
     return open_store(path)
 
 
-def choose_test(names: Collection[str], share: float) -> set[str]:
-    """Chooses the names of the test split by a hash of each name.
+def choose_test(names: Collection[str], share: float, seed: int = 0) -> set[str]:
+    """Chooses the names of the test split by a hash of each name, and of the seed unless it is 0.
 
     With a share above 0, each split gets at least one of two or more names; with 0 the test split is empty.
     """
-    ranked = sorted(names, key=lambda name: hashlib.sha256(name.encode("utf-8", "surrogatepass")).digest())
+    salt = str(seed or "")
+    ranked = sorted(names, key=lambda name: hashlib.sha256((name + salt).encode("utf-8", "surrogatepass")).digest())
     return set(ranked[: min(len(ranked) - 1, max(1, round(share * len(ranked)))) if share > 0 else 0])
 
 

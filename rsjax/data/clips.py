@@ -117,16 +117,16 @@ def readable(
         yield number, record
 
 
-def load_clips(store: Store, count: int) -> Clips:
-    """Loads ``count`` clips spread over the test split, except those that cannot be read.
+def load_clips(store: Store, count: int, split: str = "test") -> Clips:
+    """Loads ``count`` clips spread over a split, except those that cannot be read.
 
     Raises:
         StoreError: no clip can be read.
     """
-    source = store.source("test")
+    source = store.source(split)
     found = list(readable(source, spread(source, count)))
     if not found:
-        raise StoreError(f"{store.path}: its test split has no readable clip; delete it and make it again")
+        raise StoreError(f"{store.path}: its {split} split has no readable clip; delete it and make it again")
     return Clips.stacked([clip for _, clip in found], [number for number, _ in found])
 
 

@@ -2,17 +2,30 @@
 
 import math
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from rsjax.config import ComponentConfig, CurriculumStageConfig, LoopConfig, TrainConfig
+from rsjax.data.codec import Record
 from rsjax.data.loader import Arrays, CurriculumStage, Loader, MixtureComponent, Readable, Transform, place_of
 from rsjax.data.quarantine import NAME, Quarantine
 from rsjax.data.store import Store, StoreError, open_store
 
 SPLIT = "train"
+# The axis of frames in the arrays of a token record.
+FRAME_AXES = {
+    "rgb": 0,
+    "depth": 0,
+    "actions": 0,
+    "success": 0,
+    "tracks": 1,
+    "visible": 1,
+    "rgb_shifted": 1,
+    "depth_shifted": 1,
+}
 EVERYTHING = CurriculumStageConfig()
 
 
@@ -132,16 +145,37 @@ def _resolve(stage: CurriculumStageConfig, batch_size: int, own: Store, transfor
     for config in stage.components:
         assert config.annotations == "own", "the pipeline names the store that has the estimates"
         store = open_store(config.store) if config.store else own
-        component = MixtureComponent(store.source(SPLIT), transform, choose(config, store), config.weight)
+        read = transform
+        if stage.frames:
+            read = partial(first_frames, transform, stage.frames)
+        component = MixtureComponent(store.source(SPLIT), read, choose(config, store), config.weight)
         if not len(component):
             raise StoreError(f"{store.path}: its {SPLIT} split has no records; make it again")
         if config.store:
-            _check_mixable(store, component, own, MixtureComponent(own.source(SPLIT), transform))
+            _check_mixable(store, component, own, MixtureComponent(own.source(SPLIT), read))
         components.append(component)
     drawn = stage.epochs * sum(map(len, components))
     # Epochs such as 0.1 are not exact in binary, so a value just above a whole number of batches counts as that number.
     batches = max(1, math.ceil(drawn / batch_size - 1e-6))
     return CurriculumStage(tuple(components), batches * batch_size)
+
+
+def first_frames(transform: Transform, frames: int, record: Record, rng: np.random.Generator) -> Arrays:
+    """Returns the arrays of a token record that is cut to its first frames.
+
+    Raises:
+        StoreError: the record has fewer frames, or is not of tokens.
+    """
+    if record["rgb"].ndim != 3 or len(record["rgb"]) < frames:
+        raise StoreError(
+            f"a stage of the curriculum takes {frames} frames, which a record of shape {record['rgb'].shape} does not "
+            f"have; leave frames out, or lower it (only families of tokens know it)"
+        )
+    cut = dict(record)
+    for name, axis in FRAME_AXES.items():
+        if cut.get(name) is not None:
+            cut[name] = np.take(cut[name], range(frames), axis=axis)
+    return transform(cut, rng)
 
 
 def _check_mixable(store: Store, component: MixtureComponent, own: Store, own_component: MixtureComponent) -> None:

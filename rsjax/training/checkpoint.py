@@ -107,7 +107,12 @@ class Checkpoints:
             _need_space(self.directory, state)
             self._manager.save(step, args=arguments, force=True)  # force: orbax has a schedule of its own
 
-    def restore(self, template: Tree) -> tuple[Tree, dict[str, Any]]:
+    def best(self) -> int | None:
+        """Returns the step of the checkpoint with the lowest metric, the first of equals; None without a metric."""
+        kept = [step for step in self.steps() if step in self._metrics]
+        return min(kept, key=lambda step: (self._metrics[step], step), default=None)
+
+    def restore(self, template: Tree, chosen: int | None = None) -> tuple[Tree, dict[str, Any]]:
         """Returns the state and the loader's state of the newest checkpoint whose files are intact.
 
         Damaged ones are skipped with a note, and moved to ``bad-<step>``.
@@ -115,13 +120,14 @@ class Checkpoints:
         Args:
             template: a state of the same structure, or its ``jax.ShapeDtypeStruct``s. Arrays get the template's
                 shardings, whatever shardings they were saved with; without any, they go to the first device.
+            chosen: the step of the checkpoint to read instead of the newest one.
 
         Raises:
             CheckpointError: there is no checkpoint, all are damaged, or it has another architecture.
             FileError: a damaged one cannot be moved, or the last save failed.
         """
         self.wait()
-        step, faults = self._newest_intact()
+        step, faults = self._newest_intact(chosen)
         if step is None:
             reason = "; ".join(f"{step}: {fault}" for step, fault in faults) or "there is none"
             raise CheckpointError(
@@ -189,10 +195,11 @@ class Checkpoints:
                 raise
             raise FileError(f"{self.directory}: cannot write a checkpoint ({first_line(error)})") from error
 
-    def _newest_intact(self) -> tuple[int | None, list[tuple[int, str]]]:
-        """Returns the newest step whose files are intact, and the faults of newer ones."""
+    def _newest_intact(self, chosen: int | None) -> tuple[int | None, list[tuple[int, str]]]:
+        """Returns the newest step whose files are intact, or the chosen one, and the faults of newer ones."""
         faults: list[tuple[int, str]] = []
-        for step in reversed(self.steps()) if is_lead() else ():
+        steps = [step for step in self.steps() if chosen in (None, step)]
+        for step in reversed(steps) if is_lead() else ():
             fault = find_fault(self.directory / str(step))
             if fault is None:
                 return agree((step, faults), "checkpoints")

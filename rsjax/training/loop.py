@@ -63,11 +63,13 @@ def fit(
         start: makes the initial parameters from fresh ones; not called on resuming from a checkpoint.
         resume: False deletes earlier checkpoints.
         stop_at: stop (and save) after this step, as if interrupted.
-        validate: scores the weights every ``loop.eval_every`` steps; it does not affect training.
+        validate: scores the weights every ``loop.validate_every`` steps; it affects training only by
+            ``loop.early_stop``.
         per_step: the unit and amount of a step's work, such as ("frames", 64), for the rates that are shown and logged.
 
     Returns:
-        The final state on this process's first device; only its weights if it is sharded (``loop.fsdp``).
+        The final state on this process's first device; only its weights if it is sharded (``loop.fsdp``). With
+        ``loop.early_stop``, that of the best validation.
 
     Raises:
         CheckpointError: the newest checkpoint does not fit, or none can be read.
@@ -90,6 +92,8 @@ def fit(
             state = sharding.adopt(state)
         first = int(state.step)
         last = min(stop_at or loop.steps, loop.steps)
+        if exhausted(loop, checkpoints.best(), first):
+            last = first
         skips = int(state.skipped)
         compiled_step = sharding.compile(train_step, model, loop)
 
@@ -116,7 +120,7 @@ def fit(
 
             stopping = stop.asked(step)
             log_due = _is_due(step, loop.log_every, last)
-            validation_due = validate is not None and _is_due(step, loop.eval_every, last)
+            validation_due = validate is not None and _is_due(step, loop.validate_every, last)
             checkpoint_due = stopping or _is_due(step, loop.checkpoint_every, last)
             if not (log_due or validation_due or checkpoint_due):
                 continue
@@ -139,12 +143,21 @@ def fit(
                     metric = agree(score, f"validation {step}")  # the lead's, in all processes
             if checkpoint_due or (metric is not None and loop.keep_best):
                 checkpoints.save(step, sharding.portable(state), batches.state(), metric)
+            if metric is not None and step < last and exhausted(loop, checkpoints.best(), step):
+                if is_lead():
+                    note(f"{name}: stops after step {step}, as the best validation was at step {checkpoints.best()}")
+                last = step
+                break
             if stopping and step < last:
                 checkpoints.wait()
                 raise Preempted(f"{name}: stopped by SIGTERM and saved after step {step}; the same command resumes")
         # Here SIGTERM is only recorded; after this block it may keep the caller from closing the checkpoints.
         checkpoints.wait()
         profile.at(last + 1, state)
+        best = checkpoints.best()
+        whole = last == loop.steps or exhausted(loop, best, last)
+        if loop.early_stop is not None and whole and best not in (None, last):
+            state = sharding.adopt(checkpoints.restore(sharding.template(model, loop), best)[0])
         damaged = batches.quarantined()
         if damaged and is_lead():
             note(f"{damaged} damaged records were replaced; {directory / 'quarantine.jsonl'} lists them")
@@ -153,6 +166,12 @@ def fit(
         rest: dict[str, Any] = dict.fromkeys(("params", "opt_state", "ema", "extra"))
         return dataclasses.replace(state, **rest | {kept: sharding.gather(state.weights)})  # type: ignore[type-var]
     return sharding.gather(state)
+
+
+def exhausted(loop: LoopConfig, best: int | None, step: int) -> bool:
+    """Returns whether a training ends early at this step: its patience is over since the best validation."""
+    stop = loop.early_stop
+    return stop is not None and best is not None and step - best >= stop.every * stop.patience
 
 
 def _is_due(step: int, every: int, last: int) -> bool:

@@ -8,9 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rsjax.config import ComponentConfig, CurriculumStageConfig, LoopConfig
-from rsjax.data.curriculum import check_stages, choose, loader_factory
+from rsjax.config import ClipShape, ComponentConfig, CurriculumStageConfig, LoopConfig
+from rsjax.data.curriculum import check_stages, choose, first_frames, loader_factory
 from rsjax.data.store import Store, StoreError, open_store, write_store
+from rsjax.models.roboscape.records import random_record
 from tests.curricula import PAPER, mixed, stage
 from tests.data import toy
 from tests.data.toy import assert_same, jitter, take
@@ -194,3 +195,17 @@ def test_damage_is_counted_once_over_stages_and_survives_a_restart(tmp_path: Pat
     strict = loader_factory(loop(SIMPLE, EVERYTHING, max_damaged=0.0), own, jitter, tmp_path / "stage")
     with strict(None) as loader, pytest.raises(StoreError, match="1 of 10 records are damaged"):
         take(loader, 6)
+
+
+def test_a_stage_of_few_frames_reads_the_first_ones() -> None:
+    record = random_record(np.random.default_rng(0), ClipShape(6, 64, 5, 3, 2), grid=4, code_bits=6)
+    record = record | {"depth": None}
+    cut = first_frames(lambda record, rng: record, 4, record, np.random.default_rng(0))
+    assert cut["rgb"].tolist() == record["rgb"][:4].tolist()
+    assert cut["actions"].tolist() == record["actions"][:4].tolist()
+    assert cut["tracks"].tolist() == record["tracks"][:, :4].tolist()
+    assert cut["visible"].tolist() == record["visible"][:, :4].tolist()
+    assert cut["depth"] is None
+    with pytest.raises(StoreError) as caught:
+        first_frames(lambda record, rng: record, 7, record, np.random.default_rng(0))
+    assert "takes 7 frames" in str(caught.value)

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 import pytest
 
-from rsjax.config import AdamW, LoopConfig
+from rsjax.config import AdamW, EarlyStopConfig, LoopConfig
 from rsjax.errors import Preempted
 from rsjax.runtime import patient, stop_signals
 from rsjax.training.checkpoint import Checkpoints, write_checksums
@@ -222,3 +222,19 @@ def test_batches_follow_from_the_loaders_state(tmp_path: Path) -> None:
         expected = [next(batches)["x"] for _ in range(9)]
     np.testing.assert_array_equal(seen[:4], expected[:4])
     np.testing.assert_array_equal(seen[first : first + 5], expected[4:])
+
+
+def rising_after(best: int) -> Callable[[int, Any], Validation]:
+    """A validation whose metric falls up to a step, and rises from there on."""
+    return lambda step, weights: Validation(abs(step - best), {})
+
+
+@pytest.mark.parametrize("stop_at", [0, 5])
+def test_an_early_stop_uses_the_best_weights_killed_or_not(tmp_path: Path, stop_at: int) -> None:
+    early = replace(LOOP, steps=20, checkpoint_every=1, keep_last=1, early_stop=EarlyStopConfig(every=1, patience=3))
+    if stop_at:
+        train(early, tmp_path, validate=rising_after(3), stop_at=stop_at)
+    stopped = train(early, tmp_path, validate=rising_after(3))
+    assert Checkpoints(tmp_path / "checkpoints").steps() == [3, 6]
+    best = train(replace(LOOP, steps=20), tmp_path / "best", stop_at=3)
+    assert_same(stopped, best)

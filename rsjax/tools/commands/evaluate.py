@@ -92,6 +92,8 @@ def main() -> None:
     from rsjax.training import distributed
 
     distributed.initialize(options.coordinator, options.processes, options.process_id)
+    from rsjax.evaluation.results import read_result
+    from rsjax.evaluation.verdict import verdict
     from rsjax.tools.pipeline.evaluations import Request, evaluate_run
 
     changes = {name: value for name in CHANGES if (value := getattr(options, name)) is not None}
@@ -104,3 +106,4 @@ def main() -> None:
         for folder in evaluate_run(run, options.data_dir, request):
             if distributed.is_lead():
                 print(f"result: {(folder / 'result.json').absolute()}")
+                print(verdict(read_result(folder).metrics))

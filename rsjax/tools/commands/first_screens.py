@@ -52,6 +52,12 @@ FIRST_SCREENS = {
         "open {run}/report.html; rsjax play {run} drives the model",
         TINY,
     ),
+    "finetune": FirstScreen(
+        "rsjax finetune tiny --data lerobot:/data/pusht --out runs/mine",
+        "--out: clips, weights, report.html, metrics.json",
+        ("data", "out", "steps", "tokenizer", "dry-run"),
+        "open {run}/report.html; rsjax play {run} drives the model; docs/finetune.md says how to make it better",
+    ),
     "doctor": FirstScreen(
         "rsjax doctor lerobot /data/pusht --fix good.json",
         "the terminal: a line for each finding; --fix FILE writes the list of good episodes",

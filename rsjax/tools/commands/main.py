@@ -11,7 +11,7 @@ from rsjax.errors import UserError, did_you_mean
 from rsjax.runtime import answer_while_importing
 
 COMMANDS = {  # each is a module of this package with a function main
-    "Start here": ("demo", "play", "generate", "train"),
+    "Start here": ("demo", "play", "generate", "finetune", "train"),
     "Data": ("doctor", "ingest", "inspect", "store", "export"),
     "Evaluate": ("evaluate", "compare", "ablation", "paper", "results"),
     "Policies": ("record", "adapt", "judge", "synthesize", "policy_learning", "policy_evaluation", "improve", "plan"),

@@ -41,6 +41,8 @@ def main() -> None:
     from rsjax.training import distributed
 
     distributed.initialize(options.coordinator, options.processes, options.process_id)
+    from rsjax.evaluation.verdict import verdict
+    from rsjax.files import read_json
     from rsjax.tools.pipeline.run import Run
     from rsjax.tools.pipeline.stages import run_all
 
@@ -50,4 +52,5 @@ def main() -> None:
         distributed.on_lead("run directory", run.prepare, options.overwrite)
         run_all(run, options.resume, command=shlex.join([*PROG.split(), *sys.argv[1:]]))
     if distributed.is_lead():
+        print(verdict(read_json(run.directory / "metrics.json")))
         print(f"report: {run.output('report').absolute()}")

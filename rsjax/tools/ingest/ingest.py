@@ -177,7 +177,7 @@ def _pack(
     cuts, refused = refuse_odd(cut_episodes(plan, refs))
     odd = {ref.id for ref, _ in refused}
     refused += [(ref, f"id: another episode is called {ref.id} too; rename one") for ref in duplicates]
-    contents = choose_contents(cuts, plan.test_share)
+    contents = choose_contents(cuts, plan.shares)
     summary = replace(
         summarise(plan, [ref for ref in refs if ref.id not in odd], refused),
         test_clips=sum(cut.records for cut in contents.splits["test"]),
@@ -205,4 +205,7 @@ def _plan_key(plan: IngestPlan, refs: Sequence[EpisodeRef]) -> str:
     digest = hashlib.sha256()
     for ref in refs:
         digest.update(plan.keys(ref)[CLIPS].encode())
-    return content_key("ingest", digest.hexdigest(), plan.test_share)
+    shares = [plan.shares.test]
+    if plan.shares[1:] != (0.0, 0):  # otherwise the key is that of older versions
+        shares = list(plan.shares)
+    return content_key("ingest", digest.hexdigest(), *shares)

@@ -47,6 +47,10 @@ class IngestOptions:
     """The word for a scene, by the first pattern that matches its description."""
     test_share: float = 0.1
     """Share of the episodes whose clips form the test split."""
+    validation_share: float = 0.0
+    """Share of the episodes whose clips form the split validation, for an early stop; taken from the train split."""
+    split_seed: int = 0
+    """Another number chooses other episodes for these splits."""
     shots: str = "hsv-histogram"
     """hsv-histogram, transnetv2 or none; docs/annotate.md explains these and the next four options."""
     motion: str = "dis"
@@ -75,6 +79,11 @@ class IngestOptions:
     def __post_init__(self) -> None:
         require(
             0 <= self.test_share < 1, f"--test-share is {self.test_share}; it is a share of the episodes, 0 to below 1"
+        )
+        require(
+            0 <= self.validation_share < 1 - self.test_share,
+            f"--validation-share is {self.validation_share} and --test-share {self.test_share}; together they must "
+            f"leave episodes to train on",
         )
         require(
             self.cpus > 0 and self.gpus >= 0,
@@ -118,7 +127,7 @@ def make_plan(source: str, path: Path, options: IngestOptions) -> "IngestPlan":
     from rsjax.tools.ingest.clips import ClipConfig, check_first, clip_step
     from rsjax.tools.ingest.doctor import select
     from rsjax.tools.ingest.formats import open_source
-    from rsjax.tools.ingest.work_items import IngestPlan
+    from rsjax.tools.ingest.work_items import IngestPlan, SplitShares
 
     out = Path(os.path.abspath(options.out or Path("data") / source))
     require(bool(out.name), f"--out is {options.out}; name a directory for the store")
@@ -146,7 +155,8 @@ def make_plan(source: str, path: Path, options: IngestOptions) -> "IngestPlan":
     check_first(episodes, config)
     reading = content_key(json.dumps(settings, sort_keys=True))
     meta = {"config": to_dict(config) | {"methods": methods, "source": settings}}
-    return IngestPlan(episodes, steps, out, options.test_share, reading, meta)
+    shares = SplitShares(options.test_share, options.validation_share, options.split_seed)
+    return IngestPlan(episodes, steps, out, shares, reading, meta)
 
 
 def make_runner(options: IngestOptions) -> "Runner":

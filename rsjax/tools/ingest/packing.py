@@ -13,7 +13,7 @@ from rsjax.data.store import StoreError, open_store, write_store
 from rsjax.tools.ingest.clips import CLIPS, clip_labels
 from rsjax.tools.ingest.episode import EpisodeRef
 from rsjax.tools.ingest.summary import IngestSummary
-from rsjax.tools.ingest.work_items import EpisodeWork, IngestPlan
+from rsjax.tools.ingest.work_items import EpisodeWork, IngestPlan, SplitShares
 
 
 class CutEpisode(NamedTuple):
@@ -32,7 +32,7 @@ class Contents:
     """The contents of the store.
 
     Attributes:
-        splits: the episodes of ``train`` and ``test``.
+        splits: the episodes of ``train``, ``test`` and perhaps ``validation``.
         depth_unit: the unit of most train clips with depth; None if there are none. Depth in another unit is left out.
         depth_range: depth range of the train clips in that unit.
     """
@@ -50,17 +50,24 @@ class Contents:
         return sum(cut.records for cut in self.episodes() if cut.depth_unit not in (None, self.depth_unit))
 
 
-def split_episodes(refs: Sequence[EpisodeRef], test_share: float) -> dict[str, list[EpisodeRef]]:
-    """Splits episodes into ``train`` and ``test``, in order.
+def split_episodes(refs: Sequence[EpisodeRef], shares: SplitShares) -> dict[str, list[EpisodeRef]]:
+    """Splits episodes into ``train``, ``test`` and, if it has a share, ``validation``, in order.
 
-    If the source is a store with both splits, its clips stay in theirs, since several clips can show the same
-    recording; ``test_share`` is then ignored. Otherwise a hash of the ids decides: of two or more episodes each split
-    gets at least one, but ``test`` is empty if ``test_share`` is 0.
+    If the source is a store with train and other splits, its clips stay in train or go to test, since several clips can
+    show the same recording; the share of test is then ignored. Otherwise a hash of the ids decides: of two or more
+    episodes each split gets at least one, but ``test`` is empty if its share is 0. ``validation`` is taken from what
+    is not ``test``, and train keeps at least one.
     """
     test = {ref.id for ref in refs if ref.location.get("split", "train") != "train"}
     if not 0 < len(test) < len(refs):
-        test = choose_test([ref.id for ref in refs], test_share)
-    return {"train": [r for r in refs if r.id not in test], "test": [r for r in refs if r.id in test]}
+        test = choose_test([ref.id for ref in refs], shares.test, shares.seed)
+    rest = [ref.id for ref in refs if ref.id not in test]
+    chosen = {"test": test}
+    if shares.validation:
+        chosen["validation"] = choose_test(rest, shares.validation * len(refs) / len(rest), shares.seed)
+    others = set[str]().union(*chosen.values())
+    splits = {"train": [ref for ref in refs if ref.id not in others]}
+    return splits | {split: [ref for ref in refs if ref.id in ids] for split, ids in chosen.items()}
 
 
 def cut_episodes(plan: IngestPlan, refs: Sequence[EpisodeRef]) -> list[CutEpisode]:
@@ -83,10 +90,10 @@ def refuse_odd(cuts: list[CutEpisode]) -> tuple[list[CutEpisode], list[tuple[Epi
     return [cut for cut in cuts if cut.action_dim == usual], odd
 
 
-def choose_contents(cuts: Sequence[CutEpisode], test_share: float) -> Contents:
+def choose_contents(cuts: Sequence[CutEpisode], shares: SplitShares) -> Contents:
     """Splits the episodes and chooses the unit of depth, since one store cannot mix metres and relative depth."""
     by_id = {cut.ref.id: cut for cut in cuts}
-    chosen = split_episodes([cut.ref for cut in cuts], test_share)
+    chosen = split_episodes([cut.ref for cut in cuts], shares)
     splits = {split: [by_id[ref.id] for ref in refs] for split, refs in chosen.items()}
     units: Counter[str] = Counter()
     for cut in splits["train"]:

@@ -15,7 +15,7 @@ import traceback
 from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from array_record.python.array_record_module import ArrayRecordWriter
 
@@ -60,6 +60,17 @@ class Step:
     gpus: float = 0.0
 
 
+class SplitShares(NamedTuple):
+    """Shares of the episodes in the splits test and validation, the rest is train; the seed chooses which ones."""
+
+    test: float = 0.1
+    validation: float = 0.0
+    seed: int = 0
+
+
+ALL_TRAIN_BUT_A_TENTH = SplitShares()
+
+
 @dataclass(frozen=True)
 class IngestPlan:
     """What is ingested, how, and into which store. Picklable.
@@ -68,7 +79,7 @@ class IngestPlan:
         source: the episodes.
         steps: in order, each after those that it needs; the last one cuts the clips.
         out: the store.
-        test_share: share of the episodes; all clips of an episode are in one split.
+        shares: those of the splits; all clips of an episode are in one split.
         reading: a hash of how episodes are read, as far as their fingerprints do not cover it.
         meta: further entries of the store's manifest.
     """
@@ -76,7 +87,7 @@ class IngestPlan:
     source: EpisodeSource
     steps: tuple[Step, ...]
     out: Path
-    test_share: float = 0.1
+    shares: SplitShares = ALL_TRAIN_BUT_A_TENTH
     reading: str = ""
     meta: dict[str, Any] = field(default_factory=dict)
 

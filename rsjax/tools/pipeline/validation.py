@@ -1,6 +1,7 @@
-"""Scores the tokenizer and the world model on the test split during training, with pictures.
+"""Scores the tokenizer and the world model on held-out clips during training, with pictures.
 
-Validation does not affect training: it shares no random state with it.
+These are the split "validation" of the run's store, or the split "test" if it has none. Validation affects training
+only by an early stop (``train.early_stop``): it shares no random state with it.
 """
 
 from collections.abc import Iterator, Sequence
@@ -34,7 +35,7 @@ LOSS_CLIPS = 1000  # spread evenly over the test split; more would only take tim
 
 @dataclass(frozen=True)
 class WorldModelValidation:
-    """Computes the loss over up to :data:`LOSS_CLIPS` test clips, and videos of ``eval.batch_size`` of them.
+    """Computes the loss over up to :data:`LOSS_CLIPS` held-out clips, and videos of ``eval.batch_size`` of them.
 
     The first call opens the run's stores.
     """
@@ -45,7 +46,7 @@ class WorldModelValidation:
         """Scores the world model with these weights.
 
         Raises:
-            StoreError: the run's stores are missing, or their test split has no readable clip.
+            StoreError: the run's stores are missing, or their held-out split has no readable clip.
         """
         cfg = self.run.config
         numbers = spread(self._prepared, LOSS_CLIPS)
@@ -82,7 +83,8 @@ class WorldModelValidation:
 
     @cached_property
     def _prepared(self) -> RecordSource:
-        return self.run.open_prepared().source("test")
+        store = self.run.open_prepared()
+        return store.source(held_out(store))
 
     @cached_property
     def _store(self) -> Store:
@@ -94,7 +96,14 @@ class WorldModelValidation:
 
     @cached_property
     def _clips(self) -> Clips:
-        return load_clips(self._store, self.run.config.eval.batch_size)
+        return load_clips(self._store, self.run.config.eval.batch_size, held_out(self._store))
+
+
+def held_out(store: Store) -> str:
+    """Returns the split that validations read: "validation", or "test" in a store without it."""
+    if "validation" in store.splits:
+        return "validation"
+    return "test"
 
 
 def _watched(clips: Clips, made: Video, prompt_frames: int) -> dict[str, float]:
@@ -111,7 +120,7 @@ def _watched(clips: Clips, made: Video, prompt_frames: int) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class TokenizerValidation:
-    """Scores the reconstruction of frames, and of depth maps if they are encoded, of ``eval.clips`` test clips.
+    """Scores the reconstruction of frames, and of depth maps if they are encoded, of ``eval.clips`` held-out clips.
 
     The first call opens the run's store.
     """
@@ -122,7 +131,7 @@ class TokenizerValidation:
         """Scores the tokenizer with these weights: the negative PSNR of frames and depth maps, mixed as in training.
 
         Raises:
-            StoreError: the run's store is missing, or its test split has no readable clip.
+            StoreError: the run's store is missing, or its held-out split has no readable clip.
         """
         cfg = self.run.config
         clips = self._clips
@@ -158,7 +167,7 @@ class TokenizerValidation:
 
     @cached_property
     def _clips(self) -> Clips:
-        return load_clips(self._store, self.run.config.eval.clips)
+        return load_clips(self._store, self.run.config.eval.clips, held_out(self._store))
 
 
 def _psnr(truth: UInt8[np.ndarray, "B T H W 3"], seen: UInt8[np.ndarray, "B T H W 3"]) -> float:

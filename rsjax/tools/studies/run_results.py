@@ -33,6 +33,7 @@ COLUMNS = (
     "gripper_error_widths",
 )
 LIFTED = "lifted_accuracy"
+OF_A_SEED = ("seed", "store", "key", "start_from")
 ROWS = {
     "": "prediction",
     "_repeat_first": "first frame repeated",
@@ -42,10 +43,10 @@ ROWS = {
 
 
 def write_runs(path: Path, runs: Sequence[Run]) -> None:
-    """Writes the scores of finished runs that differ in nothing but their seeds.
+    """Writes the scores of finished runs that differ in nothing but their seeds and the split of their recordings.
 
     Raises:
-        UserError: a run is not finished, or two differ in more than their seeds.
+        UserError: a run is not finished, or two differ in more.
     """
     names = [f"{name}{suffix}" for name in (*COLUMNS, LIFTED) for suffix in ROWS]
     scores = []
@@ -66,9 +67,9 @@ def write_runs(path: Path, runs: Sequence[Run]) -> None:
 
 
 def _without_seeds(value: Any) -> Any:
-    """Returns a configuration, or a part of one, without its seeds."""
+    """Returns a configuration, or a part of one, without its seeds and what names its directories."""
     if isinstance(value, dict):
-        return {name: _without_seeds(part) for name, part in value.items() if name != "seed"}
+        return {name: _without_seeds(part) for name, part in value.items() if name not in OF_A_SEED}
     return value
 
 
@@ -79,11 +80,17 @@ def run_tables(content: Mapping[str, Any]) -> dict[str, Table]:
     """
     known = metrics()
     shown = [name for name in COLUMNS if any(name in run["metrics"] for run in content["runs"])]
-    head = ["", *(known[name].heading for name in shown), '"lifted" read correctly, 95 % interval']
+    lifted = any(LIFTED in run["metrics"] for run in content["runs"])
+    head = ["", *(known[name].heading for name in shown)]
+    if lifted:
+        head.append('"lifted" read correctly, 95 % interval')
     rows = []
     for suffix, label in ROWS.items():
-        cells = [_mean(content["runs"], f"{name}{suffix}", known[name].decimals) for name in shown]
-        rows.append([label, *cells, _share(content["runs"], f"{LIFTED}{suffix}")])
+        cells = [label, *(_mean(content["runs"], f"{name}{suffix}", known[name].decimals) for name in shown)]
+        if lifted:
+            cells.append(_share(content["runs"], f"{LIFTED}{suffix}"))
+        if any(cells[1:]):
+            rows.append(cells)
     return {"scores": Table(head, rows)}
 
 

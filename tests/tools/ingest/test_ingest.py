@@ -16,7 +16,7 @@ from rsjax.tools.ingest.episode import Episode, EpisodeRef
 from rsjax.tools.ingest.packing import split_episodes
 from rsjax.tools.ingest.summary import IngestSummary, lines
 from rsjax.tools.ingest.windows import WindowConfig
-from rsjax.tools.ingest.work_items import EpisodeWork
+from rsjax.tools.ingest.work_items import EpisodeWork, SplitShares
 from tests.tools.ingest.toy import CONFIG, ByDepth, Relative, Source, clip_plan, episode, ingested
 
 
@@ -87,17 +87,26 @@ def test_no_episode_is_in_both_splits(mixed: tuple[IngestSummary, Store]) -> Non
 @given(st.sets(st.text(max_size=8), max_size=12), st.floats(0, 0.99))
 def test_each_episode_is_in_one_split_and_both_have_some(names: set[str], share: float) -> None:
     refs = [EpisodeRef(name, "", {}) for name in sorted(names)]
-    splits = split_episodes(refs, share)
+    splits = split_episodes(refs, SplitShares(share))
     assert sorted(ref.id for part in splits.values() for ref in part) == sorted(names)
     if len(refs) >= 2 and share > 0:
         assert all(splits.values())
+
+
+def test_validation_is_taken_from_the_train_split_and_a_seed_chooses_others() -> None:
+    refs = [EpisodeRef(f"{number}", "", {}) for number in range(20)]
+    splits = split_episodes(refs, SplitShares(0.2, 0.1, seed=1))
+    assert {split: len(part) for split, part in splits.items()} == {"train": 14, "test": 4, "validation": 2}
+    assert sorted(ref.id for part in splits.values() for ref in part) == sorted(ref.id for ref in refs)
+    again = [split_episodes(refs, SplitShares(0.2, 0.1, seed))["test"] for seed in (1, 2)]
+    assert again[0] == splits["test"] != again[1]
 
 
 @settings(max_examples=30)
 @given(st.lists(st.sampled_from(["train", "test", "cameras"]), min_size=2, max_size=9), st.floats(0, 0.99))
 def test_clips_of_a_store_stay_on_their_side(sides: list[str], share: float) -> None:
     refs = [EpisodeRef(f"{side}-{number}", "", {"split": side}) for number, side in enumerate(sides)]
-    splits = split_episodes(refs, share)
+    splits = split_episodes(refs, SplitShares(share))
     if 0 < sides.count("train") < len(sides):
         assert {ref.id for ref in splits["train"]} == {ref.id for ref in refs if ref.id.startswith("train")}
     assert sorted(ref.id for part in splits.values() for ref in part) == sorted(ref.id for ref in refs)
@@ -158,7 +167,7 @@ def test_metres_and_relative_depth_are_not_mixed(tmp_path: Path, deep: int, unit
 
 def test_where_only_the_test_split_has_depth_none_is_kept(tmp_path: Path) -> None:
     source = Source(4)
-    test = split_episodes(list(source.episodes()), 0.25)["test"][0]
+    test = split_episodes(list(source.episodes()), SplitShares(0.25))["test"][0]
     summary = ingested(clip_plan(tmp_path, Source(4, only=test.location["number"])))
     store = open_store(tmp_path / "store")
     assert store.manifest["depth_range"] is None and store.manifest["depth_unit"] is None

@@ -19,7 +19,7 @@ from rsjax.tools.ingest.episode import Depths, Episode, EpisodeError, EpisodeRef
 from rsjax.tools.ingest.ingest import ingest
 from rsjax.tools.ingest.summary import IngestSummary
 from rsjax.tools.ingest.windows import WindowConfig
-from rsjax.tools.ingest.work_items import IngestPlan, Inputs, Records, Step
+from rsjax.tools.ingest.work_items import IngestPlan, Inputs, Records, SplitShares, Step
 from tests.tools.ingest.videos import ArrayFrames
 
 FPS = 10.0
@@ -198,7 +198,7 @@ def clip_plan(
     """Returns the plan of a store of clips in ``folder``."""
     steps = annotation_steps(annotators, config.camera)
     steps = (*steps, clip_step(config, tuple(step.name for step in steps)))
-    return IngestPlan(source, steps, folder / "store", share, meta={"config": {}})
+    return IngestPlan(source, steps, folder / "store", SplitShares(share), meta={"config": {}})
 
 
 def ingested(plan: IngestPlan, keep_clips: bool = False, retry: bool = False) -> IngestSummary | None:

@@ -14,6 +14,7 @@ from rsjax.evaluation.metrics.failures import FLAGGED
 from rsjax.evaluation.registry import Metric, metrics
 from rsjax.evaluation.results import Curves
 from rsjax.evaluation.statistics import bootstrap
+from rsjax.evaluation.verdict import verdict
 from rsjax.files import write_file
 from rsjax.progress import duration
 from rsjax.tools.studies.report.curves import curves_svg
@@ -110,6 +111,7 @@ def write_report(path: Path, report: RunReport) -> None:
     notes = Footnotes()
     html = environment.get_template("page.html.j2").render(
         report=report,
+        verdict=verdict(report.metrics),
         gallery={"rate": _FPS, "clips": [player_clip(clip) for clip in report.clips]},
         player_script=Markup(player_script()),
         player_style=Markup(player_style()),

@@ -1,0 +1,1 @@
+"""Fine-tunes a trained world model on recordings of another robot."""

@@ -1,0 +1,154 @@
+"""Decides whether the tokenizer is kept, and makes the configuration of the run."""
+
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from rsjax.clip import Video
+from rsjax.config import Config, CurriculumStageConfig, EarlyStopConfig, RuntimeConfig, TokenModelConfig, require
+from rsjax.config.config_fields import with_values
+from rsjax.data.clips import load_clips
+from rsjax.data.normalization import Normalization
+from rsjax.data.store import Store
+from rsjax.evaluation.metrics.psnr import psnr
+from rsjax.models.base import create_autoencoder
+from rsjax.tools.convert import directory as converted
+from rsjax.tools.finetune.start import Source
+from rsjax.tools.pipeline.run_clips import on_store
+from rsjax.tools.pipeline.validation import held_out
+
+MARGIN = 3.0  # dB by which the tokenizer's reconstruction must be better than the first frame repeated, to be kept
+MEASURED_CLIPS = 32
+VALIDATIONS = 8  # of each training
+
+
+@dataclass(frozen=True)
+class Finetuning:
+    """The settings of a fine-tuning.
+
+    Attributes:
+        steps: training steps of the world model at most; an early stop may end it before. 0: none, which measures the
+            model as it is, with ``tokenizer`` keep.
+        tokenizer_steps: those of the tokenizer, if it is adapted.
+        tokenizer: measure: keep it if it reconstructs the new frames well (:func:`keeps_tokenizer`); or keep or adapt.
+        learning_rate, tokenizer_learning_rate: peaks, as shares of those that the model was trained with.
+        short_share: share of the world model's steps on the first half of each clip.
+        patience: validations without a new best one that end a training; there are eight in a whole training.
+        seed: of both trainings.
+    """
+
+    steps: int = 900
+    tokenizer_steps: int = 600
+    tokenizer: Literal["measure", "keep", "adapt"] = "measure"
+    learning_rate: float = 0.5
+    tokenizer_learning_rate: float = 1.0
+    short_share: float = 0.0
+    patience: int = 3
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        require(self.steps >= 0, f"--steps is {self.steps}; it must be at least 0, which measures the model as it is")
+        require(self.tokenizer_steps >= 1, f"--tokenizer-steps is {self.tokenizer_steps}; it must be at least 1")
+        for name in ("learning_rate", "tokenizer_learning_rate"):
+            value = getattr(self, name)
+            require(value > 0, f"--{name.replace('_', '-')} is {value}; it is a share of the model's own, above 0")
+        require(0 <= self.short_share < 1, f"--short-share is {self.short_share}; it is a share of the steps, below 1")
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """How well a tokenizer reconstructs held-out frames of the recordings, in dB of PSNR.
+
+    Attributes:
+        psnr: of the tokenizer.
+        repeat_first: of the first frame repeated, which a world model has to beat.
+    """
+
+    psnr: float
+    repeat_first: float
+
+    @property
+    def good(self) -> bool:
+        """Whether a world model on these tokens could be clearly better than the first frame repeated."""
+        return self.psnr >= self.repeat_first + MARGIN
+
+    def __str__(self) -> str:
+        made = f"reconstructs held-out frames with {self.psnr:.1f} dB"
+        return f"{made}, the first frame repeated has {self.repeat_first:.1f}"
+
+
+def measure_tokenizer(source: Source, store: Store) -> Reconstruction:
+    """Measures the tokenizer of a model on held-out clips of the recordings."""
+    _, params = converted.load_tokenizer(source.directory)
+    codec = create_autoencoder(source.config).codec(params, Normalization.create(store))
+    rgb = load_clips(store, MEASURED_CLIPS, held_out(store)).rgb
+    made = codec.decode(codec.encode(Video(rgb)), np.zeros(len(rgb), bool)).rgb
+    repeated = np.repeat(rgb[:, :1], rgb.shape[1] - 1, axis=1)
+    return Reconstruction(float(np.mean(psnr(rgb, made))), float(np.mean(psnr(rgb[:, 1:], repeated))))
+
+
+def finetuned(source: Source, store: Store, start: str, settings: Finetuning, adapts: bool) -> Config:
+    """Returns the configuration of the run.
+
+    Args:
+        start: the directory of the weights to start from.
+        adapts: whether the tokenizer is trained.
+    """
+    base = replace(source.config, model=replace(source.config.model, max_frames=source.architecture.frames))
+    config = on_store(base, store.path)
+    assert isinstance(config.model, TokenModelConfig)
+    clips = len(store.source("train"))
+    own = config.tokenizer_train
+    tokenizer_steps = 0
+    if adapts:
+        tokenizer_steps = settings.tokenizer_steps
+    loop = config.train
+    short = round(settings.short_share * settings.steps)
+    stages = []
+    if short:
+        frames = max(2, config.clips.frames // 2)
+        stages.append(CurriculumStageConfig(epochs=short * loop.batch_size / clips, frames=frames))
+    if settings.steps:
+        stages.append(CurriculumStageConfig(epochs=(settings.steps - short) * loop.batch_size / clips))
+    config = replace(
+        config,
+        tokenizer_train=replace(
+            own,
+            start_from=start,
+            steps=tokenizer_steps,
+            curriculum=(),
+            optimizer=slower(own.optimizer, settings.tokenizer_learning_rate, tokenizer_steps),
+            seed=settings.seed,
+            early_stop=early_stop(settings, tokenizer_steps),
+        ),
+        train=replace(
+            loop,
+            start_from=start,
+            steps=settings.steps,
+            curriculum=tuple(stages),
+            optimizer=slower(loop.optimizer, settings.learning_rate, settings.steps),
+            seed=settings.seed,
+            early_stop=early_stop(settings, settings.steps),
+        ),
+        runtime=replace(
+            RuntimeConfig(),
+            checkpoint_every=max(1, settings.steps // VALIDATIONS),
+            workers=config.runtime.workers,
+        ),
+    )
+    after = config.model.departures.self_conditioning_after
+    if config.model.departures.self_conditioning:
+        after = min(after, settings.steps // 4)
+    return with_values(config, {"model.departures.self_conditioning_after": after, "model.state_heads": "off"})
+
+
+def early_stop(settings: Finetuning, steps: int) -> EarlyStopConfig:
+    """Returns when a training of so many steps validates and stops."""
+    return EarlyStopConfig(every=max(1, steps // VALIDATIONS), patience=settings.patience)
+
+
+def slower(optimizer: Any, share: float, steps: int) -> Any:
+    """Returns the optimizer with a share of its learning rate, and a warm-up that fits a short training."""
+    warmup = min(optimizer.warmup_steps, steps // 10)
+    return replace(optimizer, learning_rate=share * optimizer.learning_rate, warmup_steps=warmup)

@@ -1,0 +1,138 @@
+"""The clips of a fine-tuning: a store as it is, or recordings that are ingested with defaults that fit them."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from rsjax.config import require
+from rsjax.data.store import MANIFEST
+from rsjax.errors import UserError
+from rsjax.tools.ingest.actions import ActionConfig, Compose, Layout, check_declared
+from rsjax.tools.ingest.episode import Episode, EpisodeError
+from rsjax.tools.ingest.formats import FORMATS, open_source
+from rsjax.tools.ingest.options import IngestOptions, source_options
+from rsjax.tools.ingest.windows import WindowConfig
+
+RATE = 5.0  # frames per second that clips have at most: those of tiny, and of most data sets of robots
+LEAST_FRAMES = 4
+LOOKED_AT = 20  # episodes whose length and rate decide; their tables are read, not their pictures
+LENGTH_SHARE = 0.8  # of a short episode's frames, so that it gives more than one clip
+MOST_CLIPS = 4000  # about; with more, clips overlap less
+
+
+@dataclass(frozen=True)
+class Recordings:
+    """What to fine-tune on.
+
+    Attributes:
+        source: a format of ``rsjax ingest``; "" if ``path`` is a store of clips.
+        path: the data set, or the store.
+    """
+
+    source: str
+    path: Path
+
+
+def find_recordings(word: str) -> Recordings:
+    """Reads ``SOURCE:PATH``, or the path of a store of clips.
+
+    Raises:
+        UserError: it is neither, or nothing is there.
+    """
+    path = Path(word)
+    if (path / MANIFEST).exists():
+        return Recordings("", path)
+    source, colon, rest = word.partition(":")
+    if not colon or not rest:
+        raise UserError(
+            f"--data is {word!r}; write SOURCE:PATH, such as lerobot:/data/pusht (sources: {', '.join(FORMATS)}), or "
+            f"the path of a store that rsjax ingest made"
+        )
+    return Recordings(source, Path(rest))
+
+
+@dataclass(frozen=True)
+class Cutting:
+    """How recordings become clips, as far as a user chose it.
+
+    Attributes:
+        frames, rate: of a clip; 0: chosen by the recordings.
+        camera, option: as of ``rsjax ingest``.
+        depth: likewise.
+        test_share, validation_share: shares of the episodes.
+        split_seed: chooses which episodes they are.
+        workers: processes; -1: one per core.
+    """
+
+    frames: int = 0
+    rate: float = 0.0
+    camera: str = ""
+    option: tuple[str, ...] = ()
+    depth: str = "recorded"
+    test_share: float = 0.2
+    validation_share: float = 0.1
+    split_seed: int = 0
+    workers: int = -1
+
+
+def ingest_options(
+    recordings: Recordings, cutting: Cutting, image_size: int, most_frames: int, out: Path
+) -> IngestOptions:
+    """Returns options of an ingest that suit the recordings.
+
+    Clips have every n-th frame, so that the rate is 5 Hz or a little more or less, and as many frames as the model has
+    positions, or fewer if episodes are short. Where a data set does not say whether actions add up, a clip's action is
+    the recorded ones of its interval, one after another.
+
+    Args:
+        image_size: pixels a side.
+        most_frames: frames that the model takes.
+
+    Raises:
+        UserError: the data set cannot be read, has no episode, or its episodes are too short.
+    """
+    source = open_source(recordings.source, recordings.path.absolute(), **source_options(cutting.option))
+    refs = list(source.episodes())
+    episodes = []
+    reason = "there is none"
+    for ref in refs[:LOOKED_AT]:
+        try:
+            episodes.append(source.read(ref))
+        except EpisodeError as error:
+            reason = str(error)
+    require(bool(episodes), f"{recordings.path}: no episode can be read ({reason})")
+    fps = float(np.median([episode.fps for episode in episodes]))
+    every = max(1, round(fps / (cutting.rate or RATE)))
+    lengths = sorted(len(episode.timestamps) // every for episode in episodes)
+    short = lengths[len(lengths) // 4]
+    frames = cutting.frames or min(most_frames, int(LENGTH_SHARE * short))
+    require(
+        LEAST_FRAMES <= frames <= most_frames,
+        f"{recordings.path}: clips would have {frames} frames at {fps / every:.3g} Hz; the model takes {LEAST_FRAMES} "
+        f"to {most_frames}: set --rate or --frames (a quarter of the episodes has {short} frames or fewer)",
+    )
+    total = len(refs) * float(np.mean(lengths))
+    return IngestOptions(
+        out=out,
+        option=cutting.option,
+        windows=WindowConfig(frames=frames, rate=fps / every, hop=max(1, round(total / MOST_CLIPS))),
+        actions=ActionConfig(compose=how_to_compose(episodes[0], every)),
+        image_size=image_size,
+        camera=cutting.camera,
+        depth=cutting.depth,
+        test_share=cutting.test_share,
+        validation_share=cutting.validation_share,
+        split_seed=cutting.split_seed,
+        workers=cutting.workers,
+    )
+
+
+def how_to_compose(episode: Episode, every: int) -> Compose:
+    """Returns how the actions of ``every`` recorded frames become one: joined, or stacked if nobody says how."""
+    config = ActionConfig()
+    try:
+        check_declared(Layout.from_json(episode.meta.get("actions", {})), every, config)
+    except EpisodeError:
+        return "stack"
+    return config.compose

@@ -1,0 +1,145 @@
+"""A toy model with random weights, fine-tuned for a few steps on a folder of noise."""
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from rsjax.config import to_dict
+from rsjax.data.store import open_store
+from rsjax.errors import UserError
+from rsjax.files import write_json
+from rsjax.models.load_run import load
+from rsjax.models.roboscape.architecture import Architecture
+from rsjax.models.roboscape.transformer import Transformer
+from rsjax.tools.convert import directory
+from rsjax.tools.convert.directory import load_world_model
+from rsjax.tools.finetune.finetune import finetune, make_clips, prepare
+from rsjax.tools.finetune.recipe import Finetuning, Reconstruction
+from rsjax.tools.finetune.recordings import Cutting, Recordings, find_recordings
+from rsjax.tools.finetune.start import find_source, write_start
+from rsjax.tools.pipeline.run import Run
+from rsjax.training.checkpoint import save_weights
+from tests.tools.pipeline import toy
+
+CUTTING = Cutting(test_share=0.4, validation_share=0.2, workers=0)
+SETTINGS = Finetuning(steps=4, tokenizer_steps=2)
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run directory, as far as fine-tuning reads one."""
+    run = tmp_path_factory.mktemp("model")
+    cfg = toy.config()
+    write_json(run / "config.json", to_dict(cfg))
+    for part, params in {"tokenizer": toy.tokenizer_params(), "world_model": toy.world_model_params(cfg)}.items():
+        (run / part).mkdir()
+        save_weights(run / part / "weights", params)
+    return run
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Five episodes of another robot, whose actions have three numbers, at 10 Hz; nobody says what they mean."""
+    folder = tmp_path_factory.mktemp("episodes")
+    rng = np.random.default_rng(0)
+    for number in range(5):
+        frames = rng.integers(0, 256, (14, 64, 64, 3), np.uint8)
+        np.savez(folder / f"{number}.npz", frames=frames, actions=rng.normal(size=(14, 3)), fps=10.0)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def whole(model: Path, data: Path, tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """A fine-tuning that nothing stopped."""
+    out = tmp_path_factory.mktemp("whole")
+    return finetune(find_source(model), Recordings("npz", data), CUTTING, SETTINGS, out)
+
+
+def test_clips_fit_the_recordings_and_the_model(whole: Run) -> None:
+    store = open_store(whole.clips)
+    assert whole.config.clips.action_dim == 6  # two recorded actions for each frame
+    assert whole.config.clips.frames == 5
+    split_of = {name: split for split, names in store.manifest["episodes"].items() for name in names}
+    assert sorted(split_of.values()) == ["test", "test", "train", "train", "validation"]
+
+
+def test_the_run_starts_from_the_model_and_is_like_any_other(whole: Run, model: Path) -> None:
+    trained = load(whole.directory)
+    assert trained.config.train.early_stop is not None
+    assert trained.config.tokenizer_train.steps == SETTINGS.tokenizer_steps  # noise is not reconstructed
+    _, start = load_world_model(whole.directory / "start")
+    _, own = load_world_model(model)
+    assert own.keys() - start.keys() == {"action_encoder"}
+    jax.tree.map(np.testing.assert_array_equal, start, {name: own[name] for name in start})
+    assert (whole.directory / "report.html").read_text().count("repeating the first frame") >= 1
+
+
+def test_killed_and_started_again_it_has_the_same_weights(whole: Run, model: Path, tmp_path: Path) -> None:
+    again = Path(shutil.copytree(whole.directory, tmp_path / "run", symlinks=True))
+    for path in ("world_model/weights", "world_model/made.json", "evaluation", "report.html", "report"):
+        place = again / path
+        if place.is_dir():
+            shutil.rmtree(place)
+        else:
+            place.unlink()
+    newest = max((again / "world_model" / "checkpoints").glob("[0-9]"), key=lambda path: int(path.name))
+    shutil.rmtree(newest)
+    # The configuration names the weights to start from by their path.
+    shutil.move(whole.directory, tmp_path / "aside")
+    shutil.move(again, whole.directory)
+    try:
+        finetune(find_source(model), Recordings("", whole.clips), CUTTING, SETTINGS, whole.directory)
+        one = load(whole.directory).params
+    finally:
+        shutil.rmtree(whole.directory)
+        shutil.move(tmp_path / "aside", whole.directory)
+    jax.tree.map(np.testing.assert_array_equal, one, load(whole.directory).params)
+
+
+def test_another_model_or_setting_needs_another_directory(whole: Run, model: Path) -> None:
+    store = open_store(whole.clips)
+    with pytest.raises(UserError) as caught:
+        prepare(find_source(model), store, replace(SETTINGS, seed=1), whole.directory)
+    assert "choose another --out" in str(caught.value)
+
+
+def test_public_weights_are_taken_by_path(whole: Run, tmp_path: Path) -> None:
+    cfg = toy.config()
+    alone = replace(Architecture.create(cfg), depth="none", action_encoder="none", action_inputs=0)
+    public = tmp_path / "public"
+    directory.save(public, cfg.tokenizer, toy.tokenizer_params())
+    params = jax.tree.map(
+        lambda x: np.ones(x.shape, x.dtype), jax.eval_shape(Transformer(alone).init_params, jax.random.key(0))
+    )
+    directory.save(public, alone, params)
+    config = prepare(find_source(public), open_store(whole.clips), SETTINGS, tmp_path / "out")
+    assert config.model.family == "genie"
+    assert (config.model.width, config.clips.action_dim) == (cfg.model.width, 6)
+
+
+@pytest.mark.parametrize(("psnr", "kept"), [(30.0, True), (22.0, False), (14.9, False)])
+def test_the_tokenizer_is_kept_where_it_beats_the_first_frame(psnr: float, kept: bool) -> None:
+    assert Reconstruction(psnr, repeat_first=20.0).good is kept
+
+
+def test_mistakes_are_one_line(model: Path, data: Path, tmp_path: Path) -> None:
+    mistakes = {
+        "write SOURCE:PATH": lambda: find_recordings("/data/pusht"),
+        "no model there": lambda: find_source(tmp_path),
+        "no episode can be read": lambda: make_clips(
+            Recordings("folder", tmp_path), CUTTING, find_source(model), tmp_path
+        ),
+        "--rate or --frames": lambda: make_clips(
+            Recordings("npz", data), replace(CUTTING, rate=1.0), find_source(model), tmp_path
+        ),
+    }
+    for words, mistake in mistakes.items():
+        with pytest.raises(UserError) as caught:
+            mistake()
+        assert words in str(caught.value)
+        assert "\n" not in str(caught.value)
+    assert write_start(find_source(model), tmp_path / "start")
