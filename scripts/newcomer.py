@@ -79,7 +79,9 @@ def generate_writes_videos() -> None:
 def a_tiny_lerobot_set_is_finetuned_on() -> None:
     import rsjax as package
 
-    clips = [{"rgb": clip["rgb"], "actions": clip["actions"], "fps": 5.0} for clip in package.examples("tiny")]
+    examples = package.examples("tiny")
+    clips = [examples[number] for number in range(len(examples))]
+    clips = [{"rgb": clip["rgb"], "actions": clip["actions"], "fps": 5.0} for clip in clips]
     package.write_store("clips", clips)
     rsjax("export", "lerobot", "clips", "lerobot")
     printed = rsjax("finetune", "tiny", "--data", "lerobot:lerobot", "--out", "runs/mine", "--steps", "20")

@@ -52,7 +52,9 @@ def write_curriculum(stages: tuple[CurriculumStageConfig, ...]) -> str:
     entries = []
     for stage in stages:
         components = [_changed(component) for component in stage.components]
-        entry = components[0] if len(components) == 1 else {"components": components}
+        entry: dict[str, Any] = {"components": components}
+        if len(components) == 1:
+            entry = components[0]
         entry = entry | {"epochs": stage.epochs}
         if stage.restart:
             entry["restart"] = True

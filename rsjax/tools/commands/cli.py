@@ -113,7 +113,9 @@ class PresetOptions:
         return preset
 
 
-def parse(argv: Sequence[str], prog: str, description: str, options: Options) -> tuple[Config, Options]:
+def parse(
+    argv: Sequence[str], prog: str, description: str, options: Options, runs: bool = False
+) -> tuple[Config, Options]:
     """Parses ``PRESET [--option VALUE] [--section.field VALUE]``.
 
     Args:
@@ -121,6 +123,7 @@ def parse(argv: Sequence[str], prog: str, description: str, options: Options) ->
         prog: the command as the user types it, ``rsjax train``.
         description: what the command does, for ``--help``.
         options: a dataclass of the command's own options, with their defaults.
+        runs: whether a run directory may stand in the place of a preset, for its configuration.
 
     Returns:
         The preset with its overrides, checked, and the options.
@@ -142,7 +145,12 @@ def parse(argv: Sequence[str], prog: str, description: str, options: Options) ->
     name, *argv = argv
     command.refuse_repeated(argv, _adding(options))
     prog = f"{prog} {name}"
-    preset = presets.get(name)
+    if runs and (Path(name) / "config.json").exists():
+        from rsjax.models.load_run import load_config
+
+        preset = load_config(Path(name))
+    else:
+        preset = presets.get(name)
     preset_options = _parse({"preset": PresetOptions()}, argv, prog, "", rest=True).preset
     preset = preset_options.apply(preset)
     chosen, argv = choose_sections(preset, argv)

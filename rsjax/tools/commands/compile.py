@@ -38,8 +38,8 @@ class Options:
 @main_errors()
 def main() -> None:
     """Compiles, and prints memory, cost and speed."""
-    description = "Compiles for accelerators that are not here, and says what they could do at most."
-    config, options = parse(sys.argv[1:], PROG, description, Options())
+    about = "Compiles for accelerators that are not here, and says what they could do at most. PRESET may be a run."
+    config, options = parse(sys.argv[1:], PROG, about, Options(), runs=True)
     target = targets.find(options.target)
     set_xla_flags()  # as training does
     enter_environment(target.card.platform)

@@ -20,7 +20,8 @@ class Options:
 @main_errors()
 def main() -> None:
     """Prints the description."""
-    config, options = parse(sys.argv[1:], PROG, "Counts parameters, operations and memory, from shapes.", Options())
+    about = "Counts parameters, operations and memory, from shapes. PRESET may be a run directory."
+    config, options = parse(sys.argv[1:], PROG, about, Options(), runs=True)
     from rich.console import Console
 
     from rsjax.tools.describe import describe, render

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 
-from rsjax.config import Config
+from rsjax.config import Config, TokenModelConfig
 from rsjax.data.curriculum import check_stages
 from rsjax.data.store import open_store
 from rsjax.models.base import create_autoencoder, create_model
@@ -58,7 +58,8 @@ def estimate(config: Config) -> Cost:
     loop = config.train
     model = create_model(config)
     count = len(check_stages(loop, open_store(config.data.store))[0].source("train"))
-    passes = 1 + getattr(config.model.departures, "self_conditioning", 0) / 3
+    assert isinstance(config.model, TokenModelConfig)
+    passes = 1 + config.model.departures.self_conditioning / 3
     drawn = [(stage.epochs * count, stage.frames or clips.frames) for stage in loop.curriculum]
     drawn = drawn or [(loop.steps * loop.batch_size, clips.frames)]
     world_model = passes * sum(number * model.flops(frames)["train"] for number, frames in drawn)

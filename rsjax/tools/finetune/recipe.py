@@ -7,7 +7,6 @@ import numpy as np
 
 from rsjax.clip import Video
 from rsjax.config import Config, CurriculumStageConfig, EarlyStopConfig, RuntimeConfig, TokenModelConfig, require
-from rsjax.config.config_fields import with_values
 from rsjax.data.clips import load_clips
 from rsjax.data.normalization import Normalization
 from rsjax.data.store import Store
@@ -95,9 +94,14 @@ def finetuned(source: Source, store: Store, start: str, settings: Finetuning, ad
         start: the directory of the weights to start from.
         adapts: whether the tokenizer is trained.
     """
-    base = replace(source.config, model=replace(source.config.model, max_frames=source.architecture.frames))
-    config = on_store(base, store.path)
-    assert isinstance(config.model, TokenModelConfig)
+    config = on_store(source.config, store.path)
+    model = config.model
+    assert isinstance(model, TokenModelConfig)
+    after = model.departures.self_conditioning_after
+    if model.departures.self_conditioning:
+        after = min(after, settings.steps // 4)
+    departures = replace(model.departures, self_conditioning_after=after)
+    model = replace(model, max_frames=source.architecture.frames, departures=departures, state_heads=None)
     clips = len(store.source("train"))
     own = config.tokenizer_train
     tokenizer_steps = 0
@@ -111,14 +115,16 @@ def finetuned(source: Source, store: Store, start: str, settings: Finetuning, ad
         stages.append(CurriculumStageConfig(epochs=short * loop.batch_size / clips, frames=frames))
     if settings.steps:
         stages.append(CurriculumStageConfig(epochs=(settings.steps - short) * loop.batch_size / clips))
-    config = replace(
+    return replace(
         config,
+        model=model,
         tokenizer_train=replace(
             own,
             start_from=start,
             steps=tokenizer_steps,
             curriculum=(),
             optimizer=slower(own.optimizer, settings.tokenizer_learning_rate, tokenizer_steps),
+            flip=True,  # few recordings are soon learned by heart
             seed=settings.seed,
             early_stop=early_stop(settings, tokenizer_steps),
         ),
@@ -137,10 +143,6 @@ def finetuned(source: Source, store: Store, start: str, settings: Finetuning, ad
             workers=config.runtime.workers,
         ),
     )
-    after = config.model.departures.self_conditioning_after
-    if config.model.departures.self_conditioning:
-        after = min(after, settings.steps // 4)
-    return with_values(config, {"model.departures.self_conditioning_after": after, "model.state_heads": "off"})
 
 
 def early_stop(settings: Finetuning, steps: int) -> EarlyStopConfig:

@@ -13,13 +13,12 @@ from rsjax.config import Config, GenieConfig, TokenModelConfig, TransformerConfi
 from rsjax.errors import UserError
 from rsjax.evaluation.results import fingerprint
 from rsjax.files import checked_path
-from rsjax.model_directory import SETTINGS, has_weights, locate, read_settings
+from rsjax.model_directory import SETTINGS, Part, has_weights, locate, read_settings
 from rsjax.models.load_run import load_config
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.pretrained import read_architecture
 from rsjax.tokenizers.training import read_tokenizer_config
 from rsjax.tools.convert import directory as converted
-from rsjax.tools.pipeline.run import TRAINED
 from rsjax.trainable import Params
 
 ACTIONS = ("action_encoder", "null_action", "action_norms")  # parts of the names of parameters that read actions
@@ -57,7 +56,8 @@ def find_source(name: Path | str) -> Source:
             f"{directory}: no model there (no {SETTINGS}); name tiny, a run directory, a saved model, or a directory "
             f"that rsjax convert made"
         )
-    for part in TRAINED:
+    parts: tuple[Part, ...] = ("tokenizer", "world_model")
+    for part in parts:
         if not has_weights(directory, part):
             raise UserError(
                 f"{directory}: holds no {part}/weights; a run has to be finished, and a converted checkpoint needs "

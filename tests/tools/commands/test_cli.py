@@ -12,9 +12,10 @@ import tyro
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rsjax.config import Config, ConfigError, LossConfig, PublicCodeConfig, presets
+from rsjax.config import Config, ConfigError, LossConfig, PublicCodeConfig, presets, to_dict
 from rsjax.config.config_fields import with_values
 from rsjax.errors import UserError, did_you_mean
+from rsjax.files import write_json
 from rsjax.tools.commands.cli import FIRST_FIELDS, main_errors, parse, parse_options
 
 
@@ -57,6 +58,14 @@ def numbers(part: Any, prefix: str = "--") -> list[tuple[str, str]]:
 @pytest.mark.parametrize("name", sorted(presets.PRESETS))
 def test_a_preset_alone_is_that_preset(name: str) -> None:
     assert read(name) == (presets.get(name), Options())
+
+
+def test_a_run_directory_stands_for_its_configuration_where_that_is_allowed(tmp_path: Path) -> None:
+    config = dataclasses.replace(presets.get("debug"), prompt_frames=2)
+    write_json(tmp_path / "config.json", to_dict(config))
+    assert parse([str(tmp_path)], "prog", "", Options(), runs=True)[0] == config
+    with pytest.raises(ConfigError):
+        parse([str(tmp_path)], "prog", "", Options())
 
 
 @settings(max_examples=20, deadline=None)
