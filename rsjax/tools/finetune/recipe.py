@@ -20,6 +20,7 @@ from rsjax.tools.pipeline.validation import held_out
 MARGIN = 3.0  # dB by which the tokenizer's reconstruction must be better than the first frame repeated, to be kept
 MEASURED_CLIPS = 32
 VALIDATIONS = 8  # of each training
+COPIES = 12  # moved copies of each clip, at least, where the model was trained with some: few clips last longer
 
 
 @dataclass(frozen=True)
@@ -100,7 +101,10 @@ def finetuned(source: Source, store: Store, start: str, settings: Finetuning, ad
     after = model.departures.self_conditioning_after
     if model.departures.self_conditioning:
         after = min(after, settings.steps // 4)
-    departures = replace(model.departures, self_conditioning_after=after)
+    shifts = model.departures.shifts
+    if shifts:
+        shifts = max(shifts, COPIES)
+    departures = replace(model.departures, self_conditioning_after=after, shifts=shifts)
     model = replace(model, max_frames=source.architecture.frames, departures=departures, state_heads=None)
     clips = len(store.source("train"))
     own = config.tokenizer_train

@@ -123,9 +123,7 @@ def test_mistakes_are_one_line(model: Path, data: Path, tmp_path: Path) -> None:
     mistakes = {
         "write SOURCE:PATH": lambda: find_recordings("/data/pusht"),
         "no model there": lambda: find_source(tmp_path),
-        "no episode can be read": lambda: make_clips(
-            Recordings("folder", tmp_path), CUTTING, find_source(model), tmp_path
-        ),
+        "has no episode": lambda: make_clips(Recordings("folder", tmp_path), CUTTING, find_source(model), tmp_path),
         "--rate or --frames": lambda: make_clips(
             Recordings("npz", data), replace(CUTTING, rate=1.0), find_source(model), tmp_path
         ),
