@@ -19,7 +19,7 @@ def per_frame(scene: Scene) -> PerFrame:
     return psnr_where(truth, prediction, scene.of_truth(_moved))
 
 
-@metric("psnr_motion", "PSNR where it moves", unit="dB", better="higher", decimals=2, per_frame=per_frame)
+@metric("psnr_motion", "PSNR where it moves", unit="dB", better="higher", decimals=2, watch=True, per_frame=per_frame)
 def score(scene: Scene) -> PerClip:
     """Returns the mean over the predicted frames that have a score; clips in which nothing moves are left out."""
     frames = scene.shared(per_frame)

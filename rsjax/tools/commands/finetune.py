@@ -25,9 +25,9 @@ class Options:
     """SOURCE:PATH, such as lerobot:/data/pusht, with a source of rsjax ingest; or a store of clips."""
     out: Path = Path("runs/finetuned")
     """Directory of the run."""
-    steps: int = 900
+    steps: int = 600
     """Training steps of the world model at most; an early stop on held-out clips may end it before. 0: none."""
-    tokenizer_steps: int = 600
+    tokenizer_steps: int = 400
     """Those of the tokenizer, if it is adapted."""
     tokenizer: Literal["measure", "keep", "adapt"] = "measure"
     """measure: keep it if it reconstructs held-out frames 3 dB better than the first frame repeated would."""

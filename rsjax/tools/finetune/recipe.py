@@ -38,8 +38,8 @@ class Finetuning:
         seed: of both trainings.
     """
 
-    steps: int = 900
-    tokenizer_steps: int = 600
+    steps: int = 600
+    tokenizer_steps: int = 400
     tokenizer: Literal["measure", "keep", "adapt"] = "measure"
     learning_rate: float = 0.5
     tokenizer_learning_rate: float = 1.0

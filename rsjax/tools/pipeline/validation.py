@@ -37,7 +37,8 @@ LOSS_CLIPS = 1000  # spread evenly over the test split; more would only take tim
 class WorldModelValidation:
     """Computes the loss over up to :data:`LOSS_CLIPS` held-out clips, and videos of ``eval.batch_size`` of them.
 
-    The first call opens the run's stores.
+    The first call opens the run's stores. The best weights are those with the lowest loss or, for an early stop, with
+    the highest PSNR where something moves in these videos.
     """
 
     run: Run
@@ -54,7 +55,10 @@ class WorldModelValidation:
         loss = validation_loss(self._model, weights, batches)
         scores, pictures = self._videos(step, weights)
         scalars = {f"validation/{name}": value for name, value in (loss | scores).items()}
-        return Validation(loss["loss"], scalars, pictures)
+        metric = loss["loss"]
+        if cfg.train.early_stop is not None:  # the loss rises long before the videos get worse
+            metric = -scores.get("psnr_motion", scores["psnr"])
+        return Validation(metric, scalars, pictures)
 
     def _videos(self, step: int, weights: Params) -> tuple[dict[str, float], dict[str, np.ndarray]]:
         cfg = self.run.config
