@@ -17,7 +17,8 @@ NAMES = [name for group in COMMANDS.values() for name in group]
 LINES = 36  # of a terminal, at a width of 100
 # Commands that take minutes or hours. demo, play and serve run until they are stopped.
 LONG = {"train", "finetune", "ingest", "evaluate", "ablation", "paper", "record", "adapt", "judge", "synthesize",
-        "policy_learning", "policy_evaluation", "improve", "plan", "compile", "bench", "generate", "convert"}  # fmt: skip
+        "policy_learning", "policy_evaluation", "improve", "plan", "compile", "bench", "generate",
+        "convert"}  # fmt: skip
 
 
 def test_every_command_has_a_first_screen() -> None:
