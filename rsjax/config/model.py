@@ -59,6 +59,11 @@ class ModelConfig:
         return False
 
     @property
+    def without_depth(self) -> str:
+        """The flag that leaves depth out, for messages."""
+        return "--model.depth none"
+
+    @property
     def takes_actions(self) -> bool:
         """Whether generated videos depend on actions; if they do not, ΔPSNR has no meaning."""
         return True

@@ -28,7 +28,7 @@ from rsjax.config.metaworld import ML10, ML10_UNSEEN
 from rsjax.config.run import FULL_SIZE_EVAL
 from rsjax.errors import did_you_mean
 from rsjax.models.cogvideox.presets import cogvideox_2b, cogvideox_5b_i2v, cogvideox_tiny
-from rsjax.models.irasim.presets import irasim_b, irasim_l, irasim_s, irasim_tiny, irasim_xl
+from rsjax.models.irasim.presets import irasim_b, irasim_l, irasim_rgbd_tiny, irasim_s, irasim_tiny, irasim_xl
 from rsjax.models.ivideogpt.presets import ivideogpt_64, ivideogpt_256, ivideogpt_tiny
 
 
@@ -294,6 +294,7 @@ PRESETS = collect(
     irasim_l(),
     irasim_xl(),
     irasim_tiny(tiny()),
+    irasim_rgbd_tiny(tiny()),
     cogvideox_2b(),
     cogvideox_5b_i2v(),
     cogvideox_tiny(tiny()),

@@ -75,6 +75,19 @@ class Normalization:
         except (ValueError, KeyError, TypeError) as error:
             raise UserError(f"{path}: its normalization is damaged ({error}); copy the model again") from error
 
+    def require_depth_range(self) -> tuple[float, float]:
+        """Returns ``depth_range``.
+
+        Raises:
+            UserError: no clip of the data has depth.
+        """
+        if self.depth_range is None:
+            raise UserError(
+                "depth_range is null: no clip of this run's training data has depth, so depth maps cannot be encoded; "
+                "pass RGB alone, or train on clips with depth"
+            )
+        return self.depth_range
+
     def save(self, run: Path) -> None:
         """Writes what :meth:`load` reads."""
         write_json(run / FILE, asdict(self), sealed=True)

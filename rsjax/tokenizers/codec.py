@@ -17,7 +17,6 @@ from rsjax.config import TokenizerConfig
 from rsjax.data.depth_color import color_to_depth, depth_to_color
 from rsjax.data.normalization import Normalization
 from rsjax.devices import divide, map_rows, mesh_of, on_cpu
-from rsjax.errors import UserError
 from rsjax.layers.platform import by_platform
 from rsjax.tokenizers.magvit2 import run_tokenizer
 from rsjax.trainable import Params
@@ -68,7 +67,7 @@ class Codec:
         Raises:
             UserError: no clip of the data has depth.
         """
-        colors = depth_to_color(depth, *self._depth_range(), self.config.depth_scale)
+        colors = depth_to_color(depth, *self.normalization.require_depth_range(), self.config.depth_scale)
         return self._chunked("encode", colors.astype(np.uint8))
 
     def decode_rgb(self, tokens: Grids) -> UInt8[np.ndarray, "*B H W 3"]:
@@ -81,17 +80,9 @@ class Codec:
         Raises:
             UserError: no clip of the data has depth.
         """
-        near, far = self._depth_range()
+        near, far = self.normalization.require_depth_range()
         colors = self._chunked("decode", np.asarray(tokens))
         return color_to_depth(colors, near, far, self.config.depth_scale)
-
-    def _depth_range(self) -> tuple[float, float]:
-        if self.normalization.depth_range is None:
-            raise UserError(
-                "depth_range is null: no clip of this run's training data has depth, so depth maps cannot be encoded; "
-                "pass RGB alone, or train on clips with depth"
-            )
-        return self.normalization.depth_range
 
     def _chunked(self, method: Literal["encode", "decode"], images: np.ndarray) -> np.ndarray:
         def apply(chunk: np.ndarray) -> ArrayLike:

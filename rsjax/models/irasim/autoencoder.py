@@ -1,5 +1,8 @@
 """IRASim's autoencoder (networks, training, codec): SDXL's with public weights, or a small one that a run trains.
 
+With ``KLConfig.depth`` it encodes depth maps as well, as images of colours; their latents are further channels of the
+frame's.
+
 Latents are standardised channel by channel. The parameters contain the channels' means and deviations ("latents"): for
 SDXL the public factor, and for a trained autoencoder numbers that its training fits to its encoder's latents.
 
@@ -20,6 +23,7 @@ from jaxtyping import Array, Bool, Float, Key, UInt8
 
 from rsjax.clip import Video
 from rsjax.config import Config
+from rsjax.data.depth_color import color_to_depth, depth_to_color
 from rsjax.data.loader import Arrays, Transform
 from rsjax.data.normalization import Normalization
 from rsjax.devices import divide
@@ -99,7 +103,7 @@ def decode(config: KLConfig, params: Params, latents: Latents) -> Images:
 
 @dataclass(frozen=True)
 class KLTraining(distributions.PosteriorTraining):
-    """Trains the autoencoder to reconstruct RGB frames from a sample of their posterior."""
+    """Trains the autoencoder to reconstruct frames, and depth maps with ``depth``, from a sample of their posterior."""
 
     config: KLConfig
 
@@ -121,7 +125,9 @@ class KLTraining(distributions.PosteriorTraining):
         return decode(self.config, params, latents)
 
     def transform(self) -> Transform:
-        return TokenizerImages(self.train.frames_per_clip, 0.0, "linear", self.train.flip)
+        if self.config.depth == "none":
+            return TokenizerImages(self.train.frames_per_clip, 0.0, "linear", self.train.flip)
+        return TokenizerImages(self.train.frames_per_clip, self.train.depth_share, self.config.depth, self.train.flip)
 
     def batch(self, arrays: Arrays) -> distributions.Batch:
         count = arrays["images"].shape[1]  # frames of a clip
@@ -129,7 +135,7 @@ class KLTraining(distributions.PosteriorTraining):
         return {"frames": image_batch(arrays), "index": index.reshape(-1)}
 
     def codec(self, params: Params, normalization: Normalization) -> "KLCodec":
-        return KLCodec(self.config, params)
+        return KLCodec(self.config, params, normalization)
 
     def flops(self) -> dict[str, int]:
         config = replace(self.config, compute_dtype="float32")  # products of bf16 operands multiply padding too
@@ -146,22 +152,53 @@ class KLTraining(distributions.PosteriorTraining):
 
 @dataclass(frozen=True)
 class KLCodec:
-    """A trained autoencoder that takes and returns numpy arrays. The latents are standardised."""
+    """A trained autoencoder that takes and returns numpy arrays. The latents are standardised.
+
+    If it encodes depth, C is 2 z, RGB's channels and then depth's; otherwise z.
+    """
 
     config: KLConfig
     params: Params
+    normalization: Normalization
 
-    def encode(self, video: Video) -> dict[str, Float[np.ndarray, "B T h w z"]]:
-        """Returns the posterior's "mean" and "deviation" of each frame."""
-        made = in_chunks(partial(self._run, _encode), video.rgb, 3, images_per_pass(video.rgb.shape[-2]))
+    def encode(self, video: Video) -> dict[str, Float[np.ndarray, "B T h w C"]]:
+        """Returns the posterior's "mean" and "deviation" of each frame; zeros for the depth of a clip without it.
+
+        Raises:
+            UserError: the video has depth, which is to be encoded, and no clip of the training data has.
+        """
+        made = self._posterior(video.rgb)
+        if self.config.depth == "none":
+            return made
+        has_depth = video.has_depth
+        ours = {name: np.zeros_like(x) for name, x in made.items()}
+        if video.depth is not None and has_depth.any():
+            limits = self.normalization.require_depth_range()
+            colors = depth_to_color(video.depth[has_depth], *limits, self.config.depth)
+            for name, x in self._posterior(colors.astype(np.uint8)).items():
+                ours[name][has_depth] = x
+        return {name: np.concatenate([x, ours[name]], axis=-1) for name, x in made.items()}
+
+    def decode(self, tokens: dict[str, Any], has_depth: Bool[np.ndarray, " B"] | None = None) -> Video:
+        """Decodes the latents "mean" to frames, with depth for the clips that have it and NaN for the others."""
+        latents = np.asarray(tokens["mean"])
+        z = self.config.latent_channels
+        rgb = self._images(latents[..., :z])
+        if self.config.depth == "none" or has_depth is None or not has_depth.any():
+            return Video(rgb)
+        metres = np.full(rgb.shape[:-1], np.nan, np.float32)
+        colors = self._images(latents[has_depth, ..., z:])
+        metres[has_depth] = color_to_depth(colors, *self.normalization.require_depth_range(), self.config.depth)
+        return Video(rgb, metres)
+
+    def _posterior(self, images: UInt8[np.ndarray, "B T H W 3"]) -> dict[str, Float[np.ndarray, "B T h w z"]]:
+        made = in_chunks(partial(self._run, _encode), images, 3, images_per_pass(images.shape[-2]))
         mean, deviation = np.split(made, 2, axis=-1)
         return {"mean": mean, "deviation": deviation}
 
-    def decode(self, tokens: dict[str, Any], has_depth: Bool[np.ndarray, " B"] | None = None) -> Video:
-        """Decodes the latents "mean" to frames."""
-        latents = np.asarray(tokens["mean"])
+    def _images(self, latents: Float[np.ndarray, "B T h w z"]) -> UInt8[np.ndarray, "B T H W 3"]:
         side = latents.shape[-2] * self.config.downsampling
-        return Video(in_chunks(partial(self._run, _decode), latents, 3, images_per_pass(side)))
+        return in_chunks(partial(self._run, _decode), latents, 3, images_per_pass(side))
 
     def _run(self, function: Any, chunk: np.ndarray) -> Any:
         return function(self.config, self.params, divide(chunk, self.params))

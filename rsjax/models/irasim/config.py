@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 from rsjax.config.data import ClipShape
-from rsjax.config.fields import require, require_range, runtime, sampling
+from rsjax.config.fields import later, loss_weights, require, require_range, runtime, sampling
 from rsjax.config.model import ModelConfig, register_family
 from rsjax.config.tokenizer import TokenizerConfig
 from rsjax.models.diffusion.config import DenoiseConfig, NoiseConfig, check_grid
@@ -68,6 +68,10 @@ class KLConfig:
     patch_size: int = 1  # magvit2: space-to-depth before the first convolution
     local_codes: bool = False  # magvit2: a cell's latents depend on its own pixels alone
     kl_weight: float = 1e-4  # of the mean divergence of a latent number from the normal distribution
+    # Whether depth maps are encoded as well, and how their colours are spaced (rsjax/data/depth_color.py). The latents
+    # of a frame's depth are then further channels of the frame's, which the transformer denoises together: the way of
+    # Aether and TesserAct.
+    depth: Literal["none", "linear", "inverse"] = later("none")
     compute_dtype: Literal["float32", "bfloat16"] = "float32"  # of convolutions, as in TokenizerConfig
 
     def __post_init__(self) -> None:
@@ -113,7 +117,8 @@ class IRASimConfig(DiTConfig, ModelConfig):
     uses_tokenizer: ClassVar[bool] = True
     autoencoder: KLConfig = KLConfig()  # trained first, or converted
     action_dropout: float = 0.1  # share of the training clips whose actions are replaced by a learned embedding
-    error_weight: float = 1.0  # of the squared error, the only term
+    error_weight: float = 1.0  # of the squared error in the channels of RGB, all that there are without depth
+    depth_weight: float = later(1.0)  # of the squared error in the channels of depth
     noise: NoiseConfig = NoiseConfig()  # the forward process
     sample: DenoiseConfig = sampling(DenoiseConfig())  # how clips are generated; may change after training
 
@@ -128,6 +133,19 @@ class IRASimConfig(DiTConfig, ModelConfig):
     @property
     def own_autoencoder(self) -> KLConfig:
         return self.autoencoder
+
+    @property
+    def uses_depth(self) -> bool:
+        return self.autoencoder.depth != "none"
+
+    @property
+    def without_depth(self) -> str:
+        return "--model.autoencoder.depth none"
+
+    @property
+    def loss_weights(self) -> dict[str, float]:
+        off = set() if self.uses_depth else {"depth"}
+        return {name: weight for name, weight in loss_weights(self).items() if name not in off}
 
     @property
     def scanned(self) -> int:

@@ -33,7 +33,8 @@ class Architecture(DiTConfig):
     Attributes:
         frames: frames that the network processes at once.
         rows, columns: rows and columns of cells in a frame's latents.
-        channels: channels of the latents.
+        channels: channels of the latents of RGB.
+        depth: whether as many channels of depth follow them.
         action_inputs: numbers of an action and, with ``integrate_actions``, of the sum of actions so far.
     """
 
@@ -41,6 +42,7 @@ class Architecture(DiTConfig):
     rows: int = 32
     columns: int = 32
     channels: int = 4
+    depth: bool = False
     action_inputs: int = 7
 
     @property
@@ -49,9 +51,14 @@ class Architecture(DiTConfig):
         return self.rows // self.patch_size, self.columns // self.patch_size
 
     @property
+    def inputs(self) -> int:
+        """Channels of the input: RGB's latents and, with ``depth``, those of depth."""
+        return self.channels * (1 + self.depth)
+
+    @property
     def outputs(self) -> int:
         """Channels of the output: the noise and, with ``learn_sigma``, variances."""
-        return self.channels * (1 + self.learn_sigma)
+        return self.inputs * (1 + self.learn_sigma)
 
     @property
     def clip_mlp(self) -> bool:
@@ -71,6 +78,7 @@ def architecture(config: Config) -> Architecture:
         rows=side,
         columns=side,
         channels=model.autoencoder.latent_channels,
+        depth=model.uses_depth,
         action_inputs=clips.action_dim * (1 + model.integrate_actions),
     )
 
@@ -139,10 +147,8 @@ class DiT(nn.Module):
             drop: clips whose actions are replaced by the learned embedding.
         """
         cfg = self.config
-        if latents.shape[2:] != (cfg.rows, cfg.columns, cfg.channels) or latents.shape[1] > cfg.frames:
-            raise ValueError(
-                f"latents are {latents.shape[1:]}, not {(cfg.frames, cfg.rows, cfg.columns, cfg.channels)}"
-            )
+        if latents.shape[2:] != (cfg.rows, cfg.columns, cfg.inputs) or latents.shape[1] > cfg.frames:
+            raise ValueError(f"latents are {latents.shape[1:]}, not {(cfg.frames, cfg.rows, cfg.columns, cfg.inputs)}")
         patch = (cfg.patch_size, cfg.patch_size)
         x = nn.Conv(cfg.width, patch, patch, "VALID", kernel_init=XAVIER, name="patches")(latents)
         x = x.reshape(*x.shape[:2], -1, cfg.width) + grid_positions(*cfg.grid, cfg.width)
@@ -168,7 +174,7 @@ class DiT(nn.Module):
             unroll=min(cfg.unroll, pairs),
         )
         x, _ = scan(cfg, name="blocks")(x, (acted, plain), jnp.arange(pairs) == 0)
-        return self._unpatchify(self._final(x, last))[..., : cfg.channels]
+        return self._unpatchify(self._final(x, last))[..., : cfg.inputs]
 
     def _action(self, actions: Float[Array, "B T A"], drop: Bool[Array, " B"] | None) -> Float[Array, "B t D"]:
         """Returns the embedding of the actions: one for each frame, or one for all."""
@@ -207,7 +213,7 @@ class DiT(nn.Module):
     def init_params(self, key: Key[Array, ""]) -> Params:
         """Returns initial parameters, with which the network predicts zeros."""
         cfg = self.config
-        latents = jnp.zeros((1, cfg.frames, cfg.rows, cfg.columns, cfg.channels))
+        latents = jnp.zeros((1, cfg.frames, cfg.rows, cfg.columns, cfg.inputs))
         actions = jnp.zeros((1, cfg.frames, cfg.action_inputs))
         return self.init(key, latents, jnp.zeros(1, jnp.int32), actions)["params"]
 
@@ -219,7 +225,7 @@ def forward_flops(config: Architecture) -> int:
     frames = config.frames
     linear = (4 + 2 * config.mlp_ratio) * width**2  # qkv, proj, fc1, fc2
     attention = (cells + frames) * width  # scores and weighted sums, averaged over both kinds of blocks
-    patches = 2 * config.patch_size**2 * config.channels * width
+    patches = 2 * config.patch_size**2 * config.inputs * width
     acted = frames
     rows = frames - 1  # of actions that the encoder takes one by one
     inputs = config.action_inputs

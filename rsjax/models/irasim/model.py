@@ -1,5 +1,7 @@
 """The IRASim family: the transformer with its autoencoder, loss and sampler, behind the interface of world models.
 
+With ``model.autoencoder.depth`` the same transformer denoises RGB and depth together, as channels of one latent.
+
 Axes: B clips, T frames, P prompt frames, h×w cells of latents with C channels, A action inputs.
 """
 
@@ -29,7 +31,7 @@ from rsjax.models.irasim.rollout import rollout
 from rsjax.tokenizers.tokenize import described, prepare_store
 from rsjax.trainable import Params, StepContext, Term
 
-Batch = dict[str, Any]  # latents (B, T, h, w, C), actions (B, T, A), weight and index (B,)
+Batch = dict[str, Any]  # latents (B, T, h, w, C), actions (B, T, A), weight, index and (with depth) has_depth (B,)
 
 
 @implements(IRASimConfig)
@@ -66,7 +68,10 @@ class IRASim(WorldModel[Batch]):
         return DiT(self.architecture).init_params(key)
 
     def loss_terms(self, params: Params, batch: Batch, key: Key[Array, ""], context: StepContext) -> dict[str, Term]:
-        """Returns "error": the mean squared error of the predicted noise over the frames after the prompt."""
+        """Returns "error": the mean squared error of the predicted noise over the frames after the prompt.
+
+        With depth, "error" is that of RGB's channels, and "depth" that of depth's, over the clips that have it.
+        """
         noise = self.config.noise
         latents = batch["latents"]
         past = self.prompt_frames
@@ -82,15 +87,27 @@ class IRASim(WorldModel[Batch]):
         predicted: Any = DiT(self.architecture).apply({"params": params}, noisy, t, batch["actions"], drop)
         error = jnp.square(predicted - target(noise, latents, drawn, t))[:, past:]
         weight = batch["weight"].astype(jnp.float32)
-        return {"error": (jnp.sum(weight * jnp.mean(error, axis=(1, 2, 3, 4))), jnp.sum(weight))}
+
+        def term(error: Array, weight: Float[Array, " B"]) -> Term:
+            return jnp.sum(weight * jnp.mean(error, axis=(1, 2, 3, 4))), jnp.sum(weight)
+
+        if not self.config.uses_depth:
+            return {"error": term(error, weight)}
+        z = self.architecture.channels
+        terms = {"error": term(error[..., :z], weight), "depth": term(error[..., z:], weight * batch["has_depth"])}
+        return {name: terms[name] for name in self.loss_weights}
 
     def prepare(self, clips: Store, assets: Assets, folder: Path, max_damaged: float) -> Store:
         """Encodes every clip; stores the latents beside the clips for all runs with this autoencoder."""
         codec = self._codec(assets)
 
         def encode(clip: Record) -> Record:
-            latents = codec.encode(Video(clip["rgb"][None]))
-            return {name: x[0].astype(np.float16) for name, x in latents.items()} | described(clip)
+            depth = clip["depth"]
+            latents = codec.encode(Video(clip["rgb"][None], None if depth is None else depth[None]))
+            record = {name: x[0].astype(np.float16) for name, x in latents.items()} | described(clip)
+            if self.config.uses_depth:
+                record["has_depth"] = depth is not None
+            return record
 
         size = self.clips.image_size
         return prepare_store(clips, codec.config, codec.params, encode, size, folder, max_damaged)
@@ -100,12 +117,15 @@ class IRASim(WorldModel[Batch]):
 
     def example(self, rng: np.random.Generator) -> Record:
         arch = self.architecture
-        shape = (arch.frames, arch.rows, arch.columns, arch.channels)
-        return {
+        shape = (arch.frames, arch.rows, arch.columns, arch.inputs)
+        record = {
             "mean": rng.normal(size=shape).astype(np.float16),
             "deviation": np.full(shape, 0.1, np.float16),
             "actions": rng.normal(size=(arch.frames, self.clips.action_dim)).astype(np.float32),
         }
+        if arch.depth:
+            record["has_depth"] = True
+        return record
 
     def generate(
         self,
@@ -122,18 +142,18 @@ class IRASim(WorldModel[Batch]):
         known = codec.encode(prompt)["mean"]
         inputs = assets.normalization.action_inputs(actions, False)
         made = rollout(self.architecture, self.config, self.prompt_frames, params, known, inputs, numbers)
-        return codec.decode({"mean": made})
+        return codec.decode({"mean": made}, prompt.has_depth & depth)
 
     def reconstruct(self, assets: Assets, video: Video) -> Video:
         codec = self._codec(assets)
-        return codec.decode(codec.encode(video))
+        return codec.decode(codec.encode(video), video.has_depth)
 
     def pretrained_shapes(self, directory: Path) -> Params:
         saved = pretrained.check_network(directory, self.architecture)
         return jax.eval_shape(DiT(saved).init_params, jax.random.key(0))
 
     def start(self, fresh: Params, saved: Params, directory: Path) -> Params:
-        return pretrained.completed(fresh, saved)
+        return pretrained.completed(fresh, saved, self.architecture)
 
     def flops(self, frames: int) -> dict[str, int]:
         forward = forward_flops(self.architecture)
@@ -141,14 +161,17 @@ class IRASim(WorldModel[Batch]):
 
     def _codec(self, assets: Assets) -> KLCodec:
         assert assets.tokenizer is not None
-        return KLCodec(self.config.autoencoder, assets.tokenizer)
+        return KLCodec(self.config.autoencoder, assets.tokenizer, assets.normalization)
 
 
 def latent_arrays(normalization: Normalization, integrate: bool, record: Record, rng: np.random.Generator) -> Arrays:
-    """Returns a sample of a record's posterior, and the network's inputs from its actions."""
+    """Returns a sample of a record's posterior, the network's inputs from its actions, and whether it has depth."""
     mean, deviation = (record[name].astype(np.float32) for name in ("mean", "deviation"))
     drawn = rng.standard_normal(mean.shape, np.float32)
-    return {
+    arrays = {
         "latents": mean + deviation * drawn,
         "actions": normalization.action_inputs(record["actions"], integrate),
     }
+    if "has_depth" in record:
+        arrays["has_depth"] = np.asarray(record["has_depth"], np.float32)
+    return arrays

@@ -1,4 +1,4 @@
-"""The presets of IRASim: the public sizes with their training, and a small one for 2 CPU cores."""
+"""The presets of IRASim: the public sizes with their training, and small ones for 2 CPU cores."""
 
 from dataclasses import replace
 
@@ -93,4 +93,19 @@ def irasim_tiny(base: Config) -> Config:
             ema=0.998,
         ),
         runtime=replace(base.runtime, eval_every=1200),
+    )
+
+
+def irasim_rgbd_tiny(base: Config) -> Config:
+    """Returns ``irasim_tiny`` with depth as further channels of its latents, as geometry-aware world models have it.
+
+    The autoencoder learns from depth maps as often as the tokenizer of ``tiny`` does.
+    """
+    rgb = irasim_tiny(base)
+    assert isinstance(rgb.model, IRASimConfig)
+    return replace(
+        rgb,
+        name="irasim_rgbd_tiny",
+        tokenizer_train=replace(rgb.tokenizer_train, depth_share=base.tokenizer_train.depth_share),
+        model=replace(rgb.model, autoencoder=replace(rgb.model.autoencoder, depth="inverse")),
     )

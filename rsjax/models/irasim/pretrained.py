@@ -7,7 +7,9 @@ converted checkpoint has a section ``kl_autoencoder`` or ``irasim``.
 from pathlib import Path
 from typing import TypeVar
 
+import jax.numpy as jnp
 from flax.traverse_util import flatten_dict, unflatten_dict
+from jaxtyping import Array, Float
 
 from rsjax.config import Config, ConfigError, from_dict
 from rsjax.config.fields import differences
@@ -51,7 +53,7 @@ def saved_network(directory: Path) -> Architecture:
 def check_autoencoder(directory: Path, own: KLConfig) -> KLConfig:
     """Returns :func:`saved_autoencoder`; also raises UserError if its network differs from ``own``."""
     saved = saved_autoencoder(directory)
-    if differing := differences(saved, own, ("kl_weight", "compute_dtype")):
+    if differing := differences(saved, own, ("kl_weight", "compute_dtype", "depth")):
         raise UserError(
             f"{directory}: holds another autoencoder ({differing}); set these fields of model.autoencoder alike"
         )
@@ -63,7 +65,9 @@ def check_network(directory: Path, own: Architecture) -> Architecture:
     saved = saved_network(directory)
     free: tuple[str, ...] = FREE
     if own.conditioning == "frame":
-        free = (*FREE, "frames")
+        free = (*free, "frames")
+    if own.depth:
+        free = (*free, "depth")
     if differing := differences(saved, own, free):
         raise UserError(f"{directory}: holds another network ({differing}); set these fields of model alike")
     if saved.action_inputs != own.action_inputs:
@@ -71,17 +75,37 @@ def check_network(directory: Path, own: Architecture) -> Architecture:
             f"{directory}: its actions have {saved.action_inputs} numbers, these {own.action_inputs}; the first layer "
             f"of the action encoder begins fresh"
         )
+    if saved.depth != own.depth:
+        note(f"{directory}: knows no depth; the network's weights for its channels begin at zero")
     return saved
 
 
-def completed(fresh: Params, saved: Params) -> Params:
-    """Returns the saved parameters; if actions have another length, the action encoder's first layer is a fresh one."""
+def completed(fresh: Params, saved: Params, arch: Architecture) -> Params:
+    """Returns the saved parameters of a network that may have had other actions, or no depth.
+
+    If actions have another length, the action encoder's first layer is a fresh one. The weights of new channels of
+    depth are zero, in the first layer and in the last one: the network begins with the noise that it predicts of RGB
+    unchanged.
+    """
     own = flatten_dict(fresh, sep="/")
     there = flatten_dict(saved, sep="/")
     first = "action_fc1/kernel"
     if there[first].shape != own[first].shape:
         there |= {name: own[name] for name in (first, "action_fc1/bias")}
+    if there["patches/kernel"].shape != own["patches/kernel"].shape:
+        z = arch.channels
+        there["patches/kernel"] = jnp.zeros(own["patches/kernel"].shape).at[:, :, :z].set(there["patches/kernel"])
+        for name in ("final/kernel", "final/bias"):
+            there[name] = _with_depth(there[name], arch)
     return unflatten_dict(there, sep="/")
+
+
+def _with_depth(last: Float[Array, "*D out"], arch: Architecture) -> Float[Array, "*D out2"]:
+    """Returns weights of the last layer with zeros for the channels of depth: a patch's cells, then their channels."""
+    lead = last.shape[:-1]
+    noise = last.reshape(*lead, arch.patch_size**2, -1)[..., : arch.channels]
+    empty = jnp.zeros((*lead, arch.patch_size**2, arch.outputs))
+    return empty.at[..., : arch.channels].set(noise).reshape(*lead, -1)
 
 
 def _section(directory: Path, name: str, kind: type[C], stage: Part, command: str) -> C | Config:

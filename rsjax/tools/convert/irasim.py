@@ -244,6 +244,8 @@ def export(source: Path, out: Path) -> list[str]:
     """Exports a directory's transformer to a safetensors file. Errors as in :func:`convert`."""
     replaces = check_file(out)
     config, params = load_irasim(source)
+    if config.depth:
+        raise ConvertError(f"{source}: its network has channels of depth, which the public format does not know")
     tensors = to_public(config, params)
     write_safetensors(out, tensors, {METADATA: json.dumps(to_dict(config))})
     return [f"{out}: {len(tensors)} tensors of an IRASim, under their public names{replaces}"]

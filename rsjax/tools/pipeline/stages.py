@@ -137,8 +137,7 @@ def collect_clips(run: Run) -> None:
     if cfg.data is not None:
         if cfg.model.uses_depth and not run.open_clips().manifest.get("depth_range"):
             note(
-                "no clip has depth, so depth trains with its loss masked; "
-                "--model.depth none trains without it in half the time"
+                f"no clip has depth, so depth trains with its loss masked; {cfg.model.without_depth} trains without it"
             )
         return
     with Progress("collect", cfg.sim.episodes, "episodes") as progress:

@@ -14,6 +14,7 @@ from rsjax.layers.cpu import convolution
 from rsjax.models.base import create_autoencoder
 from rsjax.models.irasim.autoencoder import KLCodec, decode, init, posterior
 from rsjax.models.irasim.config import KLConfig
+from rsjax.tools.bench import inputs
 from rsjax.tools.convert.kl_autoencoder import from_public, infer_config, to_public
 from rsjax.trainable import StepContext
 from tests.models.irasim import toy
@@ -83,11 +84,12 @@ def test_codec_standardises_by_the_parameters() -> None:
     params = toy.autoencoder_params(config)
     plain = params | {"latents": jax.tree.map(np.zeros_like, params["latents"])}
     video = Video(RNG.integers(0, 256, (2, 3, 64, 64, 3), np.uint8))
-    latents, own = (KLCodec(toy.AUTOENCODER, p).encode(video) for p in (params, plain))
+    codec, of_plain = (KLCodec(toy.AUTOENCODER, p, inputs.normalization(config)) for p in (params, plain))
+    latents, own = codec.encode(video), of_plain.encode(video)
     mean, deviation = params["latents"]["mean"], np.exp(params["latents"]["log_deviation"])
     np.testing.assert_allclose(latents["mean"], (own["mean"] - mean) / deviation, atol=1e-5)
     np.testing.assert_allclose(latents["deviation"], own["deviation"] / deviation, atol=1e-5)
-    decoded = [KLCodec(toy.AUTOENCODER, p).decode(x).rgb for p, x in ((params, latents), (plain, own))]
+    decoded = [codec.decode(latents).rgb, of_plain.decode(own).rgb]
     assert np.abs(decoded[0].astype(int) - decoded[1]).max() <= 1
     assert decoded[0].shape == video.rgb.shape
 

@@ -50,6 +50,8 @@ def published_name(model: Mapping[str, Any]) -> str | None:
     """Returns the row of the paper's tables that corresponds to a model's family and settings, if there is one."""
     name = _FAMILIES.get(model["family"])
     settings = model.get("settings", {})
+    if settings.get("autoencoder", {}).get("depth", "none") != "none":
+        return None  # IRASim with channels of depth
     if name != "RoboScape":
         return name
     depth = settings.get("depth", {}).get("kind", "branch")

@@ -324,6 +324,8 @@ def test_rows_of_the_paper() -> None:
         settings = {"depth": {"kind": kind}, "loss": {"keypoints": "printed"}}
         assert published_name({"family": "roboscape", "settings": settings}) == row
     assert published_name({"family": "irasim"}) == "IRASim"
+    assert published_name({"family": "irasim", "settings": {"autoencoder": {"depth": "none"}}}) == "IRASim"
+    assert published_name({"family": "irasim", "settings": {"autoencoder": {"depth": "inverse"}}}) is None
     assert published_name({"family": "mine"}) is None
 
 

@@ -279,3 +279,12 @@ def test_claims_name_their_arms_and_are_chosen_by_name() -> None:
     with pytest.raises(ConfigError, match=r"--only tabel1: no such claim; did you mean 'table1'\? \(claims: table2"):
         chosen(["tabel1"], claims())
     assert all(budget.SEEDS >= 3 for _ in KNOWN)
+
+
+def test_the_rival_with_channels_of_depth_trains_for_as_long_as_the_one_without(three_hours: Plan) -> None:
+    names = ("RoboScape", "RGB and depth as channels", "RGB alone")
+    ours, rival, rgb = (three_hours.of("geometry", name)[0].config for name in names)
+    assert ours == three_hours.of("table1", "RoboScape")[0].config
+    assert rgb == three_hours.of("table1", "IRASim")[0].config
+    assert (rival.train, rival.tokenizer_train.steps) == (rgb.train, rgb.tokenizer_train.steps)
+    assert rival.model.uses_depth and not rgb.model.uses_depth

@@ -1,0 +1,190 @@
+"""IRASim with depth as further channels of its latents: what is as without them, and what depth may change."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import rsjax
+from rsjax.clip import Video
+from rsjax.config import Config, content_key, presets
+from rsjax.config.config_fields import with_values
+from rsjax.data.normalization import Normalization
+from rsjax.data.store import Store
+from rsjax.errors import UserError
+from rsjax.models.base import create_autoencoder, create_model
+from rsjax.models.irasim.autoencoder import KLCodec
+from rsjax.models.irasim.config import KLConfig
+from rsjax.models.irasim.dit import DiT
+from rsjax.tools.bench import inputs
+from rsjax.tools.convert.directory import save
+from rsjax.tools.convert.files import ConvertError
+from rsjax.tools.convert.irasim import export
+from rsjax.tools.describe import count
+from rsjax.tools.pipeline import stages
+from rsjax.tools.pipeline.run import Run
+from rsjax.tools.pipeline.run_clips import on_store
+from rsjax.tools.studies.results import read_metrics
+from rsjax.trainable import StepContext
+from tests.models import families
+from tests.models.irasim import toy
+from tests.tools.pipeline import toy as clips
+
+RGB = toy.config()
+DEPTH = with_values(RGB, {"model.autoencoder.depth": "inverse", "tokenizer_train.depth_share": 0.5})
+RNG = np.random.default_rng(0)
+
+
+def model(config: Config) -> Any:
+    return create_model(config)
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
+    return clips.store(tmp_path_factory.mktemp("depth") / "clips")
+
+
+def video(store: Store) -> Video:
+    """Two test clips, of which only the first has depth."""
+    records = [store.source("test")[number] for number in range(2)]
+    depth = np.stack([record["depth"] for record in records])
+    depth[1] = np.nan
+    return Video(np.stack([record["rgb"] for record in records]), depth)
+
+
+def codec(config: KLConfig, store: Store) -> KLCodec:
+    return KLCodec(config, toy.autoencoder_params(RGB), Normalization.create(store))
+
+
+def test_without_depth_the_family_keeps_its_content_keys() -> None:
+    """Those of commit 5ed1223, before it knew depth: finished runs stay finished."""
+    for name, key in {"irasim_tiny": "a51e9d60938fe9de", "irasim_xl": "a91b1bf60d086630"}.items():
+        config = presets.get(name)
+        assert content_key(config.autoencoder, config.tokenizer_train, config.model) == key
+
+
+def test_the_latents_of_rgb_are_as_without_depth_and_a_clip_without_depth_has_zeros(store: Store) -> None:
+    frames = video(store)
+    plain = codec(toy.AUTOENCODER, store).encode(frames)
+    z = toy.AUTOENCODER.latent_channels
+    both = codec(DEPTH.autoencoder, store).encode(frames)
+    for name, x in both.items():
+        np.testing.assert_array_equal(x[..., :z], plain[name])
+        assert np.abs(x[0, ..., z:]).min() > 0
+        assert not x[1, ..., z:].any()
+    made = codec(DEPTH.autoencoder, store).decode(both, frames.has_depth)
+    np.testing.assert_array_equal(made.rgb, codec(toy.AUTOENCODER, store).decode(plain).rgb)
+    near, far = clips.DEPTH_RANGE
+    assert made.depth is not None
+    assert near <= made.depth[0].min() <= made.depth[0].max() <= far
+    assert np.isnan(made.depth[1]).all()
+
+
+def test_depth_is_refused_where_no_training_clip_has_it(tmp_path: Path, store: Store) -> None:
+    without = codec(DEPTH.autoencoder, clips.store(tmp_path / "clips", depth=False))
+    with pytest.raises(UserError) as raised:
+        without.encode(video(store))
+    assert "depth_range is null" in str(raised.value)
+    assert without.encode(Video(video(store).rgb))["mean"].shape[-1] == 2 * toy.AUTOENCODER.latent_channels
+
+
+def test_weights_without_depth_begin_with_their_own_noise_of_rgb(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Whatever the channels of depth hold, and whatever the variances of ``learn_sigma`` are."""
+    for sigma in (False, True):
+        one, other = (model(with_values(config, {"model.learn_sigma": sigma})) for config in (RGB, DEPTH))
+        params = toy.params(with_values(RGB, {"model.learn_sigma": sigma}))
+        there = tmp_path / str(sigma)
+        save(there, one.architecture, params)
+        shapes = other.pretrained_shapes(there)
+        assert jax.tree.map(jnp.shape, shapes) == jax.tree.map(jnp.shape, params)
+        assert "knows no depth; the network's weights for its channels begin at zero" in capsys.readouterr().out
+        begun = other.start(jax.jit(other.init)(jax.random.key(0)), params, there)
+        z = one.architecture.channels
+        latents = RNG.normal(size=(2, *_shape(other))).astype(np.float32)
+        actions = RNG.normal(size=(2, *_actions(other))).astype(np.float32)
+        expected, found = (
+            noise(each, weights, x, actions)
+            for each, weights, x in ((one, params, latents[..., :z]), (other, begun, latents))
+        )
+        np.testing.assert_allclose(found[..., :z], expected, atol=1e-5)
+        assert np.abs(expected).min() > 0
+        assert not found[..., z:].any()
+
+
+def _shape(model: Any) -> tuple[int, ...]:
+    arch = model.architecture
+    return arch.frames, arch.rows, arch.columns, arch.inputs
+
+
+def _actions(model: Any) -> tuple[int, int]:
+    return model.architecture.frames, model.architecture.action_inputs
+
+
+def noise(model: Any, params: Any, latents: np.ndarray, actions: np.ndarray) -> np.ndarray:
+    """The noise of latents at two steps."""
+    made = jax.jit(DiT(model.architecture).apply)({"params": params}, latents, np.array([3, 700]), actions)
+    return np.asarray(made)
+
+
+def test_a_clip_without_depth_counts_in_the_term_of_rgb_alone() -> None:
+    ours = model(DEPTH)
+    params = toy.params(DEPTH)
+    batch = inputs.batch(ours, DEPTH, 3)
+
+    @jax.jit
+    def terms(has_depth: Any, latents: Any) -> Any:
+        part = batch | {"has_depth": has_depth, "latents": latents}
+        return ours.loss_terms(params, part, jax.random.key(0), StepContext(jnp.int32(0), None, None))
+
+    whole = terms(np.ones(3, np.float32), batch["latents"])
+    assert whole.keys() == ours.loss_weights.keys() == {"error", "depth"}
+    fewer = terms(np.array([1, 0, 1], np.float32), batch["latents"])
+    assert fewer["error"] == whole["error"]
+    assert (whole["depth"][1], fewer["depth"][1]) == (3, 2)
+    assert fewer["depth"][0] < whole["depth"][0]
+    none = terms(np.zeros(3, np.float32), batch["latents"])
+    assert none["depth"] == (0, 0)
+
+
+def test_public_files_know_no_depth(tmp_path: Path) -> None:
+    ours = model(DEPTH)
+    save(tmp_path / "there", ours.architecture, toy.params(DEPTH))
+    with pytest.raises(ConvertError) as raised:
+        export(tmp_path / "there", tmp_path / "out.safetensors")
+    assert "channels of depth, which the public format does not know" in str(raised.value)
+
+
+def test_a_run_goes_through_all_stages_and_is_scored_by_its_depth(tmp_path: Path, store: Store) -> None:
+    config = families.engine(DEPTH)
+    config = replace(config, tokenizer_train=replace(config.tokenizer_train, depth_share=0.5))
+    run = Run(on_store(config, store.path), tmp_path / "run", tmp_path)
+    run.prepare(overwrite=False)
+    stages.run_all(run)
+    assert all(map(run.finished, run.stages))
+    scores = read_metrics(run)
+    known = {name for name, value in scores.items() if value is not None}
+    assert {"psnr", "delta_psnr", "depth_absrel", "depth_delta1", "depth_delta2", "depth_absrel_tokenizer"} <= known
+    trained = rsjax.load(run.directory)
+    clip = store.source("test")[0]
+    made = trained.generate(clip["rgb"][:1], clip["actions"], depth=clip["depth"][:1])
+    assert made.depth is not None
+    assert made.depth.shape == made.rgb.shape[:-1]
+    assert trained.generate(clip["rgb"][:1], clip["actions"]).depth is None
+
+
+def test_the_small_preset_is_that_of_rgb_with_depth() -> None:
+    rgb, depth = presets.get("irasim_tiny"), presets.get("irasim_rgbd_tiny")
+    values = {"name": rgb.name, "model.autoencoder.depth": "none", "tokenizer_train.depth_share": 0.0}
+    assert with_values(depth, values) == rgb
+    assert depth.model.uses_depth and not rgb.model.uses_depth
+    assert create_autoencoder(rgb).shapes() == create_autoencoder(depth).shapes()
+    shapes = [jax.eval_shape(create_model(config).init, jax.random.key(0)) for config in (rgb, depth)]
+    assert [count(each) for each in shapes] == [2_556_304, 2_560_416]
+    one, other = (create_model(config).flops(16)["train"] for config in (rgb, depth))
+    assert other / one == pytest.approx(1.002, abs=0.0005)
