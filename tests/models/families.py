@@ -43,9 +43,10 @@ def ivideogpt() -> Config:
 
 
 def irasim() -> Config:
-    """IRASim with an autoencoder of its own, whose batches are accumulated."""
-    base = engine(toy_irasim.config(integrate_actions=True))
-    return with_values(base, {"train.accumulate": 2, "tokenizer_train.accumulate": 2})
+    """IRASim on RGB and depth with an autoencoder of its own, whose batches are accumulated."""
+    base = with_values(engine(toy_irasim.config(integrate_actions=True)), {"model.autoencoder.depth": "inverse"})
+    accumulated = {"train.accumulate": 2, "tokenizer_train.accumulate": 2}
+    return with_values(base, {**accumulated, "tokenizer_train.depth_share": 0.5})
 
 
 def cogvideox() -> Config:

@@ -69,7 +69,11 @@ def test_a_run_goes_through_all_stages(run: Run) -> None:
         assert metrics["reasons"]["delta_psnr"] == "the model takes no actions"
     else:
         assert "delta_psnr" in scores
-    assert metrics["reasons"]["depth_absrel"] == "the model generates no depth"
+    depth = {"depth_absrel", "depth_delta1", "depth_delta2", "depth_absrel_tokenizer"}
+    if run.config.model.uses_depth:
+        assert depth <= scores
+    else:
+        assert metrics["reasons"]["depth_absrel"] == "the model generates no depth"
     for stage in TRAINED:
         rows = read_log(run.directory / stage)
         assert any("validation/psnr" in row for row in rows)
@@ -81,6 +85,10 @@ def test_a_loaded_model_generates_plans_and_goes_on_beyond_its_clips(run: Run, t
     model, clip = rsjax.load(run.directory), run.open_clips().source("test")[0]
     video = model.generate(clip["rgb"][:1], clip["actions"])
     assert video.rgb.shape == clip["rgb"].shape and video.depth is None
+    if run.config.model.uses_depth:
+        depth = model.generate(clip["rgb"][:1], clip["actions"], depth=clip["depth"][:1]).depth
+        assert depth is not None and depth.shape == clip["depth"].shape
+        assert np.isfinite(depth).all()
     many = model.plan(clip["rgb"][:1], np.stack([clip["actions"], -clip["actions"]]))
     np.testing.assert_allclose(many.rgb[0].astype(int), video.rgb, atol=1)  # batches of two sizes round differently
     setting = SETTING[run.config.model.family]

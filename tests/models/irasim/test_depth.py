@@ -1,6 +1,8 @@
-"""IRASim with depth as further channels of its latents: what is as without them, and what depth may change."""
+"""IRASim with depth as further channels of its latents: what is as without them, and what depth may change.
 
-from dataclasses import replace
+tests/models/test_families.py takes it through a whole run.
+"""
+
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import rsjax
 from rsjax.clip import Video
 from rsjax.config import Config, content_key, presets
 from rsjax.config.config_fields import with_values
@@ -25,12 +26,7 @@ from rsjax.tools.convert.directory import save
 from rsjax.tools.convert.files import ConvertError
 from rsjax.tools.convert.irasim import export
 from rsjax.tools.describe import count
-from rsjax.tools.pipeline import stages
-from rsjax.tools.pipeline.run import Run
-from rsjax.tools.pipeline.run_clips import on_store
-from rsjax.tools.studies.results import read_metrics
 from rsjax.trainable import StepContext
-from tests.models import families
 from tests.models.irasim import toy
 from tests.tools.pipeline import toy as clips
 
@@ -95,26 +91,24 @@ def test_depth_is_refused_where_no_training_clip_has_it(tmp_path: Path, store: S
 def test_weights_without_depth_begin_with_their_own_noise_of_rgb(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Whatever the channels of depth hold, and whatever the variances of ``learn_sigma`` are."""
-    for sigma in (False, True):
-        one, other = (model(with_values(config, {"model.learn_sigma": sigma})) for config in (RGB, DEPTH))
-        params = toy.params(with_values(RGB, {"model.learn_sigma": sigma}))
-        there = tmp_path / str(sigma)
-        save(there, one.architecture, params)
-        shapes = other.pretrained_shapes(there)
-        assert jax.tree.map(jnp.shape, shapes) == jax.tree.map(jnp.shape, params)
-        assert "knows no depth; the network's weights for its channels begin at zero" in capsys.readouterr().out
-        begun = other.start(jax.jit(other.init)(jax.random.key(0)), params, there)
-        z = one.architecture.channels
-        latents = RNG.normal(size=(2, *_shape(other))).astype(np.float32)
-        actions = RNG.normal(size=(2, *_actions(other))).astype(np.float32)
-        expected, found = (
-            noise(each, weights, x, actions)
-            for each, weights, x in ((one, params, latents[..., :z]), (other, begun, latents))
-        )
-        np.testing.assert_allclose(found[..., :z], expected, atol=1e-5)
-        assert np.abs(expected).min() > 0
-        assert not found[..., z:].any()
+    """Whatever the channels of depth hold, also with the variances of ``learn_sigma``."""
+    sigma = {"model.learn_sigma": True}
+    one, other = (model(with_values(config, sigma)) for config in (RGB, DEPTH))
+    params = toy.params(with_values(RGB, sigma))
+    save(tmp_path, one.architecture, params)
+    shapes = other.pretrained_shapes(tmp_path)
+    assert jax.tree.map(jnp.shape, shapes) == jax.tree.map(jnp.shape, params)
+    assert "knows no depth; the network's weights for its channels begin at zero" in capsys.readouterr().out
+    fresh = toy.params(with_values(DEPTH, sigma))
+    begun = other.start(fresh, params, tmp_path)
+    z = one.architecture.channels
+    latents = RNG.normal(size=(2, *_shape(other))).astype(np.float32)
+    actions = RNG.normal(size=(2, *_actions(other))).astype(np.float32)
+    expected = noise(one, params, latents[..., :z], actions)
+    found = noise(other, begun, latents, actions)
+    np.testing.assert_allclose(found[..., :z], expected, atol=1e-5)
+    assert np.abs(expected).min() > 0
+    assert not found[..., z:].any()
 
 
 def _shape(model: Any) -> tuple[int, ...]:
@@ -158,24 +152,6 @@ def test_public_files_know_no_depth(tmp_path: Path) -> None:
     with pytest.raises(ConvertError) as raised:
         export(tmp_path / "there", tmp_path / "out.safetensors")
     assert "channels of depth, which the public format does not know" in str(raised.value)
-
-
-def test_a_run_goes_through_all_stages_and_is_scored_by_its_depth(tmp_path: Path, store: Store) -> None:
-    config = families.engine(DEPTH)
-    config = replace(config, tokenizer_train=replace(config.tokenizer_train, depth_share=0.5))
-    run = Run(on_store(config, store.path), tmp_path / "run", tmp_path)
-    run.prepare(overwrite=False)
-    stages.run_all(run)
-    assert all(map(run.finished, run.stages))
-    scores = read_metrics(run)
-    known = {name for name, value in scores.items() if value is not None}
-    assert {"psnr", "delta_psnr", "depth_absrel", "depth_delta1", "depth_delta2", "depth_absrel_tokenizer"} <= known
-    trained = rsjax.load(run.directory)
-    clip = store.source("test")[0]
-    made = trained.generate(clip["rgb"][:1], clip["actions"], depth=clip["depth"][:1])
-    assert made.depth is not None
-    assert made.depth.shape == made.rgb.shape[:-1]
-    assert trained.generate(clip["rgb"][:1], clip["actions"]).depth is None
 
 
 def test_the_small_preset_is_that_of_rgb_with_depth() -> None:
