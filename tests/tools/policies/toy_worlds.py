@@ -108,9 +108,10 @@ def imagined(count: int, pace: float = 1.0, judge: Any = judge, draws: list[list
     return ModelWorld(trained_like(Model(), {"pace": pace}), count, judge, action_range(RANGE))
 
 
-def trained_like(model: Any, params: Any) -> Any:
+def trained_like(model: Any, params: Any, uses_depth: bool = False) -> Any:
     """A trained model as far as a world looks at it."""
-    config = SimpleNamespace(prompt_frames=2, clips=SimpleNamespace(action_dim=6), tokenizer=None, model=None)
+    settings = SimpleNamespace(uses_depth=uses_depth)
+    config = SimpleNamespace(prompt_frames=2, clips=SimpleNamespace(action_dim=6), tokenizer=None, model=settings)
     assets = SimpleNamespace(normalization=None, tokenizer=None)
     return SimpleNamespace(config=config, model=model, params=params, assets=assets)
 

@@ -203,15 +203,17 @@ class WholeVideoImagination:
 
     def __init__(self, trained: TrainedModel) -> None:
         self._trained = trained
+        self._depth = trained.config.model.uses_depth
 
     def restart(self, which: Bool[np.ndarray, " B"], first: Video, index: Int[np.ndarray, " B"]) -> Video:
         assert which.all(), "clips begin together"
         trained = self._trained
-        self._frames = (trained.model.reconstruct(trained.assets, Video(first.rgb)) or first).rgb
+        seen = first if self._depth else Video(first.rgb)
+        self._frames = trained.model.reconstruct(trained.assets, seen) or seen
         self._actions = np.zeros((len(which), 1, trained.config.clips.action_dim), np.float32)
         self._index = np.asarray(index)
         self._steps = 0
-        return Video(self._frames)
+        return self._frames
 
     def step(self, actions: Float[np.ndarray, "B A"]) -> Video:
         trained = self._trained
@@ -219,13 +221,17 @@ class WholeVideoImagination:
         rows = np.concatenate([self._actions, actions[:, None]], axis=1)
         index = (self._index + self._steps * DRAWS) % 2**31
         video = trained.model.generate(
-            trained.params, trained.assets, Video(self._frames), rows, index=index, depth=False
+            trained.params, trained.assets, self._frames, rows, index=index, depth=self._depth
         )
-        frame = video.rgb[:, -1:]
-        self._frames = np.concatenate([self._frames, frame], axis=1)[:, -prompt_frames:]
+        frame = video.frames(-1)
+        rgb = np.concatenate([self._frames.rgb, frame.rgb], axis=1)
+        depth = None
+        if self._frames.depth is not None and frame.depth is not None:
+            depth = np.concatenate([self._frames.depth, frame.depth], axis=1)
+        self._frames = Video(rgb, depth).frames(-prompt_frames)
         self._actions = rows[:, -prompt_frames:]
         self._steps += 1
-        return Video(frame)
+        return frame
 
 
 def model_key(trained: TrainedModel) -> str:

@@ -56,31 +56,44 @@ def test_a_first_frame_that_looks_like_success_ends_nothing() -> None:
     assert one.success.tolist() == [False, True] and len(other.rgb) == 5
 
 
-def test_a_family_that_generates_whole_videos_goes_on_from_its_last_frames() -> None:
+@pytest.mark.parametrize("uses_depth", [False, True])
+def test_a_family_that_generates_whole_videos_goes_on_from_its_last_frames(uses_depth: bool) -> None:
     calls: list[Any] = []
 
     class Whole:
-        """Brightens the last given frame by the last action; its frames are even numbers, as it sees them."""
+        """Brightens the last given frame by the last action; its frames are even numbers, as it sees them.
+
+        If it uses depth, everything is a metre further away in each frame.
+        """
 
         imagine = WorldModel.imagine
 
         def reconstruct(self, assets: Any, video: Video) -> Video:
-            return Video(video.rgb // 2 * 2)
+            assert (video.depth is not None) == uses_depth
+            return Video(video.rgb // 2 * 2, video.depth)
 
         def generate(self, params: Any, assets: Any, prompt: Video, actions: Any, *, index: Any, depth: bool) -> Video:
             calls.append((prompt.rgb.shape[1], actions[0, :, 0].tolist(), index.tolist()))
             last = prompt.rgb[:, -1:] + actions[:, -1, 0].astype(np.uint8)[:, None, None, None, None]
-            return Video(np.concatenate([prompt.rgb, last], axis=1))
+            rgb = np.concatenate([prompt.rgb, last], axis=1)
+            assert depth == uses_depth
+            if prompt.depth is None:
+                return Video(rgb)
+            return Video(rgb, np.concatenate([prompt.depth, prompt.depth[:, -1:] + 1], axis=1))
 
-    world = ModelWorld(trained_like(Whole(), {}), 3, judge, action_range(9.0))  # one more than needed
+    world = ModelWorld(trained_like(Whole(), {}, uses_depth), 3, judge, action_range(9.0))  # one more than needed
     given = iter(range(1, 9))
     for _ in range(2):  # the second time nothing of the first is left
         calls.clear()
-        starts = [FirstFrame(np.full((16, 16, 3), level, np.uint8), None, level) for level in (11, 20)]
+        metres = np.ones((16, 16), np.float32)
+        starts = [FirstFrame(np.full((16, 16, 3), level, np.uint8), metres, level) for level in (11, 20)]
         one, other = run_episodes(world, lambda observation: np.full((2, 6), next(given), np.float32), starts, 4)
         steps = one.actions[:, 0].tolist()
         assert one.rgb[:, 0, 0, 0].tolist() == (10 + np.cumsum(steps)).tolist()
         assert other.rgb[:, 0, 0, 0].tolist() == (20 + np.cumsum(steps)).tolist()
+        assert (one.depth is not None) == uses_depth
+        if one.depth is not None:
+            assert one.depth[:, 0, 0].tolist() == [1, 2, 3, 4, 5]
         assert [length for length, _, _ in calls] == [1, 2, 2, 2]
         assert [rows for _, rows, _ in calls] == [steps[:2], steps[:3], steps[1:4], steps[2:]]
         assert len({number for _, _, index in calls for number in index[:2]}) == 8  # draws of its own for each frame
