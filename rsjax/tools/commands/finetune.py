@@ -25,10 +25,11 @@ class Options:
     """SOURCE:PATH, such as lerobot:/data/pusht, with a source of rsjax ingest; or a store of clips."""
     out: Path = Path("runs/finetuned")
     """Directory of the run."""
-    steps: int = 600
-    """Training steps of the world model at most; an early stop on held-out clips may end it before. 0: none."""
-    tokenizer_steps: int = 400
-    """Those of the tokenizer, if it is adapted."""
+    steps: int = -1
+    """Training steps of the world model at most; an early stop on held-out clips may end it before. 0: none; -1: each
+    clip 18 times, at most 1500 steps."""
+    tokenizer_steps: int = -1
+    """Those of the tokenizer, if it is adapted; -1: each clip 27 times, at most 600 steps."""
     tokenizer: Literal["measure", "keep", "adapt"] = "measure"
     """measure: keep it if it reconstructs held-out frames 3 dB better than the first frame repeated would."""
     learning_rate: float = 0.5

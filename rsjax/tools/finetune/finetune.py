@@ -56,6 +56,7 @@ def prepare(source: Source, store: Store, settings: Finetuning, out: Path) -> Co
     """
     folder = out / START
     start = str(folder.absolute())
+    settings = settings.for_clips(source.config, len(store.source("train")))
     finetuned(source, store, start, settings, adapts=True)  # raises before anything is written
     key = content_key("finetune", str(source.directory.absolute()), store.manifest.get("key"), settings)
     with make_once(folder, key, refuse=OTHERS) as work:

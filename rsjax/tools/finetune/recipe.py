@@ -20,6 +20,11 @@ from rsjax.tools.pipeline.validation import held_out
 MARGIN = 3.0  # dB by which the tokenizer's reconstruction must be better than the first frame repeated, to be kept
 MEASURED_CLIPS = 32
 VALIDATIONS = 8  # of each training
+EPOCHS = 18  # of the world model
+TOKENIZER_EPOCHS = 27
+LEAST_STEPS = 100
+MOST_STEPS = 1500
+MOST_TOKENIZER_STEPS = 600
 COPIES = 12  # moved copies of each clip, at least, where the model was trained with some: few clips last longer
 
 
@@ -28,9 +33,9 @@ class Finetuning:
     """The settings of a fine-tuning.
 
     Attributes:
-        steps: training steps of the world model at most; an early stop may end it before. 0: none, which measures the
-            model as it is, with ``tokenizer`` keep.
-        tokenizer_steps: those of the tokenizer, if it is adapted.
+        steps: training steps of the world model at most; an early stop may end it before. -1: by the number of clips
+            (:meth:`for_clips`); 0: none, which measures the model as it is, with ``tokenizer`` keep.
+        tokenizer_steps: those of the tokenizer, if it is adapted; -1: likewise.
         tokenizer: measure: keep it if it reconstructs the new frames well (:func:`keeps_tokenizer`); or keep or adapt.
         learning_rate, tokenizer_learning_rate: peaks, as shares of those that the model was trained with.
         short_share: share of the world model's steps on the first half of each clip.
@@ -38,8 +43,8 @@ class Finetuning:
         seed: of both trainings.
     """
 
-    steps: int = 600
-    tokenizer_steps: int = 400
+    steps: int = -1
+    tokenizer_steps: int = -1
     tokenizer: Literal["measure", "keep", "adapt"] = "measure"
     learning_rate: float = 0.5
     tokenizer_learning_rate: float = 1.0
@@ -48,12 +53,34 @@ class Finetuning:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        require(self.steps >= 0, f"--steps is {self.steps}; it must be at least 0, which measures the model as it is")
-        require(self.tokenizer_steps >= 1, f"--tokenizer-steps is {self.tokenizer_steps}; it must be at least 1")
+        require(self.steps >= -1, f"--steps is {self.steps}; give a number, or -1 for as many as suit the clips")
+        require(
+            self.tokenizer_steps == -1 or self.tokenizer_steps >= 1,
+            f"--tokenizer-steps is {self.tokenizer_steps}; give a number above 0, or -1 for as many as suit the clips",
+        )
         for name in ("learning_rate", "tokenizer_learning_rate"):
             value = getattr(self, name)
             require(value > 0, f"--{name.replace('_', '-')} is {value}; it is a share of the model's own, above 0")
         require(0 <= self.short_share < 1, f"--short-share is {self.short_share}; it is a share of the steps, below 1")
+
+    def for_clips(self, config: Config, clips: int) -> "Finetuning":
+        """Returns the settings with steps for so many training clips, where they are not given.
+
+        Few clips are soon learned by heart, so each is drawn a number of times; the bounds are for few and many clips.
+        """
+
+        def steps(given: int, batch: int, epochs: int, most: int) -> int:
+            if given >= 0:
+                return given
+            return min(most, max(LEAST_STEPS, round(epochs * clips / batch)))
+
+        return replace(
+            self,
+            steps=steps(self.steps, config.train.batch_size, EPOCHS, MOST_STEPS),
+            tokenizer_steps=steps(
+                self.tokenizer_steps, config.tokenizer_train.batch_size, TOKENIZER_EPOCHS, MOST_TOKENIZER_STEPS
+            ),
+        )
 
 
 @dataclass(frozen=True)
