@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rsjax.config import Config, EvalConfig, NoDepth
+from rsjax.config import Config, EarlyStopConfig, EvalConfig, NoDepth
 from rsjax.data.clips import readable
 from rsjax.data.depth_color import depth_to_color
 from rsjax.data.loader import Arrays, Transform
@@ -111,7 +111,11 @@ def test_there_is_a_picture_of_each_shown_clip_with_depth_only_where_the_model_h
     blind = Run(toy.with_model(run.config, depth=NoDepth()), run.directory, run.data_directory)
     monkeypatch.setattr(module, "validation_loss", lambda *_: {"loss": 0.5})
     seen = WorldModelValidation(blind)(7, trained(blind).params)
-    assert seen.scalars.keys() == {"validation/loss", "validation/psnr"}
+    assert seen.scalars.keys() == {"validation/loss", "validation/psnr", "validation/psnr_motion"}
+    assert seen.metric == 0.5
+    early = replace(blind.config, train=replace(blind.config.train, early_stop=EarlyStopConfig()))
+    by_video = WorldModelValidation(replace(blind, config=early))(7, trained(blind).params)
+    assert by_video.metric == -seen.scalars["validation/psnr_motion"]
     assert seen.pictures["clip_000"].shape[0] < found.pictures["clip_000"].shape[0]
 
 
