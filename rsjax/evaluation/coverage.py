@@ -29,7 +29,7 @@ from rsjax.data.codec import decode, encode
 from rsjax.data.store import Store
 from rsjax.evaluation.generation import teacher_forced
 from rsjax.evaluation.results import fingerprint
-from rsjax.files import write_file
+from rsjax.files import regular, write_file
 from rsjax.models.trained import TrainedModel
 
 FOLDER = "coverage"  # in the run directory
@@ -173,7 +173,7 @@ def read_coverage(trained: TrainedModel, store: Store, run: Path, clips: int = C
     if not is_finished(folder, coverage_key(trained, store, clips)):
         return None
     try:
-        return Coverage(**decode((folder / FILE).read_bytes()))
+        return Coverage(**decode(regular(folder / FILE).read_bytes()))
     except (OSError, ValueError, TypeError):
         return None
 

@@ -17,7 +17,7 @@ from rsjax.clip import Video
 from rsjax.data.clips import Clips
 from rsjax.data.codec import Record, decode, encode
 from rsjax.evaluation.protocols import Protocol
-from rsjax.files import write_file
+from rsjax.files import regular, write_file
 from rsjax.models.base import TeacherForced
 from rsjax.models.trained import TrainedModel
 from rsjax.progress import Progress
@@ -136,7 +136,7 @@ class Generation:
         if self.folder is None:
             return self._memory.get(batch)
         try:
-            return decode((self.folder / batch.name).read_bytes())
+            return decode(regular(self.folder / batch.name).read_bytes())
         except (OSError, ValueError):
             return None
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from rsjax.data.codec import decode, encode
 from rsjax.data.store import StoreError
-from rsjax.files import FileError, read_json, write_atomically, write_file, write_json
+from rsjax.files import FileError, read_json, regular, write_atomically, write_file, write_json
 
 NAME = "result.json"
 FRAMES = "frames.msgpack"
@@ -66,7 +66,7 @@ def load_evaluation(path: Path) -> Evaluation:
         StoreError: the file is damaged.
     """
     try:
-        record = decode(path.read_bytes())
+        record = decode(regular(path).read_bytes())
         scores = {name: record.pop(name) for name in ("metrics", "reasons", "per_clip", "curves")}
     except (ValueError, KeyError) as error:
         raise StoreError(f"{path}: damaged ({error}); delete it and run again") from error
@@ -160,7 +160,7 @@ def read_frames(folder: Path) -> dict[str, np.ndarray]:
         StoreError: the file is missing or damaged.
     """
     try:
-        return decode((folder / FRAMES).read_bytes())
+        return decode(regular(folder / FRAMES).read_bytes())
     except (OSError, ValueError) as error:
         raise StoreError(f"{folder / FRAMES}: cannot be read ({error}); evaluate again with --overwrite") from error
 

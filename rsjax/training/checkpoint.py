@@ -24,7 +24,7 @@ from jaxtyping import PyTree
 from orbax.checkpoint import checkpoint_managers as ocm
 
 from rsjax.errors import UserError, first_line
-from rsjax.files import FileError, disk_guard, parse_json, placeholder, replace_directory
+from rsjax.files import FileError, disk_guard, parse_json, placeholder, regular, replace_directory
 from rsjax.progress import note
 from rsjax.training.distributed import agree, is_lead, on_lead
 
@@ -366,7 +366,7 @@ def find_fault(checkpoint: Path) -> str | None:
 
 def _size_and_checksum(path: Path) -> list[int]:
     size = checksum = 0
-    with path.open("rb") as file:
+    with regular(path).open("rb") as file:
         while chunk := file.read(CHUNK_BYTES):
             size += len(chunk)
             checksum = zlib.crc32(chunk, checksum)
@@ -385,7 +385,7 @@ def _read_checksums(checkpoint: Path) -> dict[str, Any]:
         ValueError: the file is damaged.
     """
     path = checkpoint / CHECKSUMS
-    content = parse_json(path.read_bytes())
+    content = parse_json(regular(path).read_bytes())
     if content.pop("crc32", None) != _checksum(content):
         raise ValueError(f"{path}: its checksum is wrong")
     return content

@@ -1,4 +1,5 @@
 import gc
+import os
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -138,6 +139,12 @@ def test_a_flipped_bit_in_weights_is_refused_wherever_it_is(tmp_path: Path) -> N
             with pytest.raises(CheckpointError) as raised:
                 load_weights(path, weights)
             assert str(raised.value).startswith(f"{path}: is damaged (")
+        file.unlink()
+        os.mkfifo(file)  # which nobody writes to
+        with pytest.raises(CheckpointError) as raised:
+            load_weights(path, weights)
+        assert "a pipe or device" in str(raised.value)
+        file.unlink()
         file.write_bytes(content)
     load_weights(path, weights)
     (path / module.CHECKSUMS).unlink()  # as those of older versions

@@ -23,7 +23,7 @@ from rsjax.config import content_key
 from rsjax.data.codec import Record, encode
 from rsjax.data.store import WRITER_OPTIONS, Source
 from rsjax.errors import UserError
-from rsjax.files import disk_guard, parse_json, safe_id, write_atomically
+from rsjax.files import disk_guard, parse_json, regular, safe_id, write_atomically
 from rsjax.tools.ingest.episode import Episode, EpisodeRef, EpisodeSource
 
 Summary = dict[str, Any]  # what a step says about its output, JSON-ready
@@ -128,7 +128,7 @@ class EpisodeWork:
         """Reads a work item's mark; None if it was not run, or its output is missing or truncated."""
         output = self.output(step)
         try:
-            mark = parse_json(mark_path(output).read_bytes())
+            mark = parse_json(regular(mark_path(output)).read_bytes())
             numbers = [mark["seconds"], mark["cpu_seconds"]]
             if mark["status"] == "failed":
                 whole = True

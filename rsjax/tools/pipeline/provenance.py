@@ -18,7 +18,7 @@ import rsjax
 from rsjax.config import Config, TrainConfig, to_dict
 from rsjax.config.config_fields import config_fields
 from rsjax.data.store import MANIFEST
-from rsjax.files import FileError, parse_json, read_json, write_json
+from rsjax.files import FileError, parse_json, read_json, regular, write_json
 from rsjax.tools.pipeline.run import Run
 
 NAME = "run.json"
@@ -104,7 +104,7 @@ def data_fingerprint(path: Path) -> dict[str, Any]:
     known: dict[str, Any] = {"path": str(path.absolute())}
     # The stage that reads the store reports the damage.
     with suppress(OSError, ValueError, KeyError, TypeError, AttributeError):
-        raw = (path / MANIFEST).read_bytes()
+        raw = regular(path / MANIFEST).read_bytes()
         known["manifest_sha256"] = hashlib.sha256(raw).hexdigest()
         manifest = parse_json(raw)
         files = {name: split["files"] for name, split in manifest["splits"].items()}
