@@ -8,6 +8,7 @@ import re
 import shutil
 import socket
 import stat
+import tempfile
 import time
 import zlib
 from collections.abc import Iterator
@@ -92,6 +93,30 @@ def checked_path(path: object, what: str) -> Path:
             f"{LONGEST_NAME}"
         )
     return Path(os.fsdecode(coded))
+
+
+def check_place(path: Path, what: str, directory: bool) -> None:
+    """Checks, before hours of work, that something can be written at a path that a user named.
+
+    Args:
+        what: the option, for error messages.
+        directory: whether it will be a directory, and not a file.
+
+    Raises:
+        FileError: it is no path, something of another kind is there, or nothing can be written there.
+    """
+    path = checked_path(path, what).absolute()
+    try:
+        if path.exists() and (not path.is_dir() if directory else not path.is_file()):
+            raise FileError(f"{what} is {path}: no {'directory' if directory else 'file'}; choose another path")
+        place = next(each for each in (path, *path.parents) if each.is_dir() or os.path.lexists(each))
+        if not place.is_dir() and place != path:
+            raise FileError(f"{what} is {path}: {place} is no directory; choose another path")
+        if directory or place != path:
+            with tempfile.TemporaryFile(dir=place):
+                pass
+    except OSError as error:
+        raise FileError(f"{what} is {path}: nothing can be written there ({error.strerror}); choose another") from error
 
 
 def regular(path: Path) -> Path:

@@ -19,7 +19,18 @@ from rsjax.data.normalization import FILE, Normalization
 from rsjax.data.quarantine import read_quarantine
 from rsjax.data.store import open_store
 from rsjax.errors import UserError
-from rsjax.files import FileError, checked_path, content_hash, holder, is_held, lock, making, placeholder, read_json
+from rsjax.files import (
+    FileError,
+    check_place,
+    checked_path,
+    content_hash,
+    holder,
+    is_held,
+    lock,
+    making,
+    placeholder,
+    read_json,
+)
 from rsjax.tokenizers.lpips import load_lpips
 from rsjax.tools.convert.files import read_tensors
 from rsjax.tools.ingest.annotators.network import require_weights
@@ -227,3 +238,21 @@ def test_a_changed_digit_of_sealed_numbers_is_refused(tmp_path: Path) -> None:
     del values["crc32"]  # as files of older versions
     path.write_text(json.dumps(values))
     assert Normalization.load(tmp_path) == saved
+
+
+def test_a_place_that_nothing_can_be_written_to_is_named_before_the_work(tmp_path: Path) -> None:
+    file = tmp_path / "file"
+    file.write_text("something")
+    for path in (tmp_path, tmp_path / "new" / "below"):
+        check_place(path, "--out", directory=True)
+    for path in (file, tmp_path / "new" / "sheet.png"):
+        check_place(path, "--sheet", directory=False)
+    wrong = [
+        (path, True) for path in (file, file / "below", Path("/proc/nowhere"), tmp_path / ("n" * 300), Path("a\0b"))
+    ]
+    wrong += [(tmp_path, False), (file / "below", False), (Path("/proc/nowhere"), False)]
+    for path, directory in wrong:
+        with pytest.raises(FileError) as raised:
+            check_place(path, "--out", directory)
+        assert str(raised.value).startswith("--out is ")
+    assert list(tmp_path.iterdir()) == [file]

@@ -19,6 +19,7 @@ from rsjax.config import Config, ConfigError, CurriculumStageConfig, check_numbe
 from rsjax.config.config_fields import config_fields, with_sections, with_values
 from rsjax.config.curriculum import read_curriculum, write_curriculum
 from rsjax.errors import did_you_mean
+from rsjax.files import check_place
 from rsjax.tools.commands.first_screens import FIRST_SCREENS
 
 Options = TypeVar("Options")
@@ -56,16 +57,24 @@ FIRST_FIELDS = {
     "eval.depth-estimator": "What estimates depth from frames: simulator, or a network (see docs/evaluation.md).",
 }
 
+# Options that name what a command writes, checked before it works.
+PLACES = {
+    **dict.fromkeys(("out", "run_dir", "dir", "into", "blind"), "directory"),
+    **dict.fromkeys(("json", "dump", "fix", "sheet", "rerun_file"), "file"),
+}
+
 REGISTRY = tyro.constructors.ConstructorRegistry()
 
 
 @REGISTRY.primitive_rule
 def _path(info: tyro.constructors.PrimitiveTypeInfo) -> tyro.constructors.PrimitiveConstructorSpec | None:
     """Reads a path; an empty word, as of a variable that is not set, would mean the working directory."""
-    if info.type is not Path:
+    if info.type not in (Path, Path | None):
         return None
 
-    def read(words: list[str]) -> Path:
+    def read(words: list[str]) -> Path | None:
+        if words[0] == "None" and info.type is not Path:
+            return None
         if not words[0]:
             raise ValueError("an empty path; name one, or . for the working directory")
         return Path(words[0])
@@ -74,7 +83,7 @@ def _path(info: tyro.constructors.PrimitiveTypeInfo) -> tyro.constructors.Primit
         nargs=1,
         metavar="PATH",
         instance_from_str=read,
-        is_instance=lambda value: isinstance(value, Path),
+        is_instance=lambda value: isinstance(value, Path) or (value is None and info.type is not Path),
         str_from_instance=lambda path: [str(path)],
     )
 
@@ -331,7 +340,18 @@ def _parse(parts: dict[str, Any], argv: Sequence[str], prog: str, description: s
         parsed = parsed[0]
     if "options" in parts:
         check_numbers(parsed.options, "--", dash=True)
+        _check_places(parsed.options)
     return parsed
+
+
+def _check_places(options: Any) -> None:
+    """Checks the directories and files that options name for what a command will write."""
+    hints = get_type_hints(type(options), include_extras=True)
+    for field in dataclasses.fields(options):
+        path = getattr(options, field.name)
+        named = field.name in PLACES and tyro.conf.Positional not in get_args(hints[field.name])
+        if named and isinstance(path, Path) and path != field.default:
+            check_place(path, f"--{_flag(field.name)}", PLACES[field.name] == "directory")
 
 
 def _one_line(report: str, parts: dict[str, Any]) -> str:

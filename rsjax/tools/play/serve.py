@@ -62,6 +62,8 @@ def serve(data: RunData, policy: Path | None, split: str, out: Path, settings: S
     Raises:
         UserError: the run is missing or unfinished, cannot generate frame by frame, or the address is taken.
     """
+    if data.moved is not None:
+        data.clips  # noqa: B018 - a store that was named has to be there; a run's own may be missing
     run = PlayRun(data, split, load_policy(policy) if policy else None, out)
     engine = Engine(run.trained, settings.lanes)
     check_policy(run)
