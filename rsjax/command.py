@@ -14,6 +14,7 @@ from rsjax.errors import Preempted, UserError, storage_limit
 from rsjax.runtime import INTERRUPTED, TERMINATED, exit_now, stop_signals
 
 LONGEST_WORD = 400  # characters of a word in a message, such as a path; longer ones are cut off
+LONGEST_LINE = 1000  # characters of a message; the middle of a longer one is left out
 UNREAD = 128 + signal.SIGPIPE  # the exit status of a process that SIGPIPE ends
 
 
@@ -141,7 +142,10 @@ def _exit(line: str, status: int) -> None:
 def _readable(line: str) -> str:
     """Returns a message as one line of what can be seen: control characters escaped, and long words cut off."""
     words = [word if len(word) <= LONGEST_WORD else f"{word[:80]}… ({len(word)} characters)" for word in line.split()]
-    return "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in " ".join(words))
+    text = " ".join(words)
+    if len(text) > LONGEST_LINE:
+        text = f"{text[: LONGEST_LINE - 300]} … {text[-250:]}"
+    return "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in text)
 
 
 def is_lead() -> bool:

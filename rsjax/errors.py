@@ -17,6 +17,9 @@ class UserError(Exception):
 
     status = 2
 
+    def __init__(self, message: object = "") -> None:
+        super().__init__(" ".join(map(str.strip, str(message).splitlines())))  # an array that it shows may have lines
+
 
 def did_you_mean(word: str, choices: Iterable[str], prefix: str = "") -> str:
     """Returns ``"; did you mean 'tiny'?"`` with the nearest of ``choices``, or "" if none is near.

@@ -14,6 +14,8 @@ from rsjax.errors import UserError
 
 T = TypeVar("T")
 
+MOST = 10**9  # of a command's numbers other than seeds: that many of anything take years
+_MOST = f"it can be at most {MOST:,}"
 MOST_SEED = 2**32 - 1  # jax.random.key drops higher bits, so two seeds would give the same draws
 
 
@@ -93,10 +95,12 @@ def check_numbers(settings: Any, prefix: str = "", dash: bool = False) -> None:
             elif isinstance(item, float):
                 finite = math.isfinite(item) or item == f.default  # a limit that is off may be infinite
                 require(finite, f"{name} is {item}; it must be a finite number")
+                require(not dash or not finite or abs(item) <= MOST or item == f.default, f"{name} is {item}; {_MOST}")
             elif isinstance(item, int) and f.name in ("seed", "seeds"):
                 require(0 <= item <= MOST_SEED, f"{name} is {item}; a seed is a whole number from 0 to {MOST_SEED}")
             elif isinstance(item, int):
                 require(abs(item) < 2**63, f"{name} is {item}; it must fit in 64 bits")
+                require(not dash or abs(item) <= MOST, f"{name} is {item}; {_MOST}")
 
 
 def section_choices(hint: Any) -> dict[str, Any]:
