@@ -8,7 +8,7 @@ from pathlib import Path
 
 import tyro
 
-from rsjax.config import ConfigError
+from rsjax.config import ConfigError, require
 from rsjax.runtime import tune_process
 from rsjax.tools.commands.cli import main_errors, parse_options, part
 from rsjax.tools.policies.studies.adaptation import Adaptation
@@ -39,6 +39,12 @@ class Options(Adaptation):
     out: Path | None = None
     """Directory of the new runs and results; default RUN-adapted."""
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("trials", "max_steps", "together"):
+            value = getattr(self, name)
+            require(value >= 1, f"--{name.replace('_', '-')} is {value}; it must be at least 1")
+
 
 @main_errors()
 def main() -> None:
@@ -49,12 +55,13 @@ def main() -> None:
         raise ConfigError("name policies with --policy DIR, recorded episodes with --episodes STORE, or both")
     from rsjax.tools.policies.policy import load_policy
     from rsjax.tools.policies.run_data import RunData, named
-    from rsjax.tools.policies.studies.adaptation import Behaviour, adapt
+    from rsjax.tools.policies.studies.adaptation import Behaviour, adapt, scores_of
     from rsjax.tools.policies.studies.trials import Trials, open_lift
     from rsjax.tools.policies.worlds.actions import check_takes_actions
 
     data = RunData(options.run, options.data_dir)
     check_takes_actions(data.config.model, f"{options.run}: the model")
+    scores_of(data.run)  # raises before simulators start if the run was not evaluated
     trials = Trials(options.trials, options.max_steps, options.together)
     out = options.out or options.run.absolute().with_name(f"{options.run.absolute().name}-adapted")
     policies = {name: load_policy(place) for name, place in named(options.policy).items()}
