@@ -18,7 +18,8 @@ class ClipShape:
 class DataConfig:
     """A store of clips made by ``rsjax ingest``, to train on instead of simulated episodes.
 
-    ``--store`` fills it in (:func:`rsjax.tools.pipeline.run_clips.on_store`).
+    ``--store`` fills it in (:func:`rsjax.tools.pipeline.run_clips.on_store`). A preset may give the shape of the clips
+    alone, without path and key: enough to describe and compile it, not to train.
     """
 
     store: str = field(metadata={"runtime": True})  # its path

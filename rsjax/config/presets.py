@@ -9,6 +9,7 @@ from rsjax.config import (
     Config,
     ConfigError,
     CurriculumStageConfig,
+    DataConfig,
     Departures,
     DepthHead,
     EvalConfig,
@@ -179,6 +180,22 @@ def roboscape_l() -> Config:
     return _full_size("roboscape_l", RoboScapeConfig(width=1024, heads=16))
 
 
+def roboscape_agibot() -> Config:
+    """Returns ``roboscape_s`` on AgiBot-World: the paper's own data, which ``rsjax ingest`` makes (docs/agibot.md).
+
+    Clips have 16 frames at 2 Hz and actions of 16 numbers. The tokenizer is a public MAGVIT-2 that stays frozen, since
+    the authors' "was trained on large-scale, general RGB image and video datasets, not specially for colorized depth
+    images". Curriculum, 1,200 test clips and five evaluations of each are those of ``roboscape_s``.
+    """
+    shape = DataConfig(store="", key="", frames=16, image_size=256, tracks=256, action_dim=16, test_clips=1200)
+    return replace(
+        roboscape_s(),
+        name="roboscape_agibot",
+        data=shape,
+        tokenizer_train=TokenizerTrainConfig(steps=0, start_from="magvit2"),
+    )
+
+
 def _physics(name: str, config: Config) -> Config:
     """Returns a preset with depth as a second head and without keypoint terms, which docs/results/depth.md measures.
 
@@ -277,6 +294,7 @@ PRESETS = collect(
     roboscape_s(),
     roboscape_m(),
     roboscape_l(),
+    roboscape_agibot(),
     roboscape_tiny(),
     roboscape_multitask(),
     _physics("roboscape_physics_tiny", roboscape_tiny()),

@@ -42,7 +42,8 @@ class IngestOptions:
     """The camera to use; the episode's first by default."""
     difficulty: tuple[str, ...] = ()
     """The difficulty of tasks, by the first pattern that matches: 'pick*=simple' '*fold*=difficult'. If none matches
-    the task, the patterns are tried on the segment's text, and then on its skill."""
+    the task, the patterns are tried on the segment's text, and then on its skill. agibot: those of AgiBot-World's tasks
+    (docs/agibot.md)."""
     scene: tuple[str, ...] = ()
     """The word for a scene, by the first pattern that matches its description."""
     test_share: float = 0.1

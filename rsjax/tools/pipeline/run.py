@@ -161,8 +161,14 @@ class Run:
             overwrite: whether to delete trained stages of another configuration instead of refusing.
 
         Raises:
-            RunError: the directory contains a trained stage of another configuration; the message names the fields.
+            RunError: the directory contains a trained stage of another configuration (the message names the fields), or
+                the configuration has clips of a shape alone.
         """
+        if self.config.data is not None and not self.config.data.key:
+            raise RunError(
+                f"{self.config.name} trains on a store of clips, and none is named: make it with rsjax ingest, and add "
+                f"--store STORE (docs/agibot.md)"
+            )
         if is_saved(self.directory):
             raise RunError(f"{self.directory}: is a saved model; train in another --run-dir, with --train.start-from")
         for stage in (stage for stage in TRAINED if stage in self.stages):

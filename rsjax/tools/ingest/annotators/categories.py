@@ -1,11 +1,14 @@
 """Labels of a clip for a curriculum: its task's difficulty and its scene, from tables of patterns."""
 
+import csv
 import fnmatch
 from dataclasses import dataclass
+from pathlib import Path
 
 from rsjax.clip import UNKNOWN
 from rsjax.config import ConfigError
 
+AGIBOT = "agibot"  # stands for the table of AgiBot-World's tasks (docs/agibot.md)
 Table = tuple[tuple[str, str], ...]  # shell pattern (case is ignored) and label; the first match counts
 
 
@@ -40,7 +43,7 @@ def look_up(table: Table, text: str) -> str:
 
 
 def parse_table(field: str, rows: tuple[str, ...]) -> Table:
-    """Parses rows such as ``pick*=simple``.
+    """Parses rows such as ``pick*=simple``; the word ``agibot`` stands for the rows of AgiBot-World's tasks.
 
     Args:
         field: the option's name, for the error message.
@@ -50,6 +53,9 @@ def parse_table(field: str, rows: tuple[str, ...]) -> Table:
     """
     table: list[tuple[str, str]] = []
     for row in rows:
+        if (field, row) == ("--difficulty", AGIBOT):
+            table += agibot_difficulties()
+            continue
         pattern, equals, label = row.rpartition("=")
         if not (equals and pattern and label):
             raise ConfigError(f"{field} {row!r}: write PATTERN=WORD, such as 'pick*=simple'")
@@ -59,3 +65,11 @@ def parse_table(field: str, rows: tuple[str, ...]) -> Table:
             )
         table.append((pattern, label))
     return tuple(table)
+
+
+def agibot_difficulties() -> Table:
+    """Returns a pattern for each name of AgiBot-World's tasks, longer ones first, since one name begins another."""
+    text = Path(__file__).with_name("agibot_tasks.tsv").read_text(encoding="utf-8")
+    rows = csv.DictReader(text.splitlines(), delimiter="\t")
+    table = [(f"{row['name']}*", row["difficulty"]) for row in rows]
+    return tuple(sorted(table, key=lambda row: -len(row[0])))

@@ -1,6 +1,6 @@
 """Videos whose pictures say their number, for the tests of formats."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -37,17 +37,29 @@ def write_video(
     options: Mapping[str, str] | None = None,
 ) -> Path:
     """An MP4 of these pictures with a key frame every 5; its folder is made. ``options`` are the codec's."""
+    return write_pictures(path, [picture(number, size) for number in numbers], fps, codec, rotation, options)
+
+
+def write_pictures(
+    path: Path,
+    pictures: Sequence[np.ndarray],
+    fps: float = 30,
+    codec: str = "libx264",
+    rotation: int = 0,
+    options: Mapping[str, str] | None = None,
+) -> Path:
+    """Any pictures (H, W, 3), as :func:`write_video` writes its own."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with av.open(str(path), "w", format="mp4") as container:
         stream: Any = container.add_stream(
             codec, rate=Fraction(fps).limit_denominator(1000), options=_OPTIONS[codec] | dict(options or {})
         )
-        stream.height, stream.width, stream.pix_fmt = *size, "yuv420p"
+        stream.height, stream.width, stream.pix_fmt = *pictures[0].shape[:2], "yuv420p"
         stream.codec_context.gop_size = 5
         if rotation:
             stream.set_display_rotation(rotation)
-        for number in numbers:
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture(number, size), format="rgb24")))
+        for image in pictures:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
         container.mux(stream.encode())
     return path
 
