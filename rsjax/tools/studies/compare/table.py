@@ -11,11 +11,11 @@ from rsjax.evaluation.registry import Metric
 from rsjax.tools.studies import tables
 from rsjax.tools.studies.compare.groups import Group, noted
 from rsjax.tools.studies.compare.published import (
-    SOURCE,
     published,
     published_name,
     published_score_of,
     published_text,
+    source_of,
 )
 from rsjax.tools.studies.compare.scores import Difference, Entry, Score, columns, difference, entries_of, score_of
 from rsjax.tools.studies.tables import ABSENT, CellText, Footnotes, Marked, Table, interval_text, mean_text
@@ -163,7 +163,8 @@ def legend(comparison: Comparison) -> list[str]:
     if 1 in counts:
         lines.append("A group of one seed is one training: its intervals say nothing about other seeds.")
     if comparison.papers:
-        lines.append(f"Published: {SOURCE}. Its LPIPS network and depth alignment are not stated.")
+        source = source_of(comparison.protocol["name"])
+        lines.append(f"Published: {source}. Its LPIPS network and depth alignment are not stated.")
     return lines + comparison.notes
 
 
@@ -233,6 +234,6 @@ def as_json(comparison: Comparison) -> dict[str, Any]:
         "reference": comparison.reference.name,
         "groups": made,
         "scores": _records(comparison),
-        "published": SOURCE,
+        "published": source_of(first.protocol["name"]),
         "legend": legend(comparison),
     }

@@ -11,6 +11,7 @@ import pytest
 
 from rsjax.config import ConfigError
 from rsjax.errors import UserError
+from rsjax.evaluation.protocols import PROTOCOLS
 from rsjax.evaluation.results import Result
 from rsjax.evaluation.statistics import bootstrap, welch
 from rsjax.tools.studies.compare.groups import noted, parse_group, read_groups
@@ -138,6 +139,36 @@ def test_files_have_published_numbers_apart_and_reasons(make: Make, tmp_path: Pa
     assert page.count("data:image/webp") == len(strips(found)) >= 6
     assert "published" in page
     assert 'class="met">better' in page
+
+
+def with_model(made: Result, family: str) -> Result:
+    return replace(made, model=made.model | {"family": family, "run": family})
+
+
+def test_bair_has_the_authors_numbers_beside_the_best_of_100_samples(make: Make) -> None:
+    best = {"psnr_best100_incl_ctx": 24.0, "lpips_vgg_best100_incl_ctx": 0.06, "psnr": 20.0, "lpips_vgg": 0.2}
+    ours = replace(
+        toy.result(0.0),
+        label="ivideogpt-bair",
+        protocol=PROTOCOLS["ivideogpt-bair"].described(),
+        metrics=dict(best),
+        per_clip={name: [value] * toy.CLIPS for name, value in best.items()},
+    )
+    groups = [make(name, with_model(ours, name)) for name in ("roboscape", "ivideogpt")]
+    text = as_markdown(compare(read_groups(groups, "ivideogpt-bair")))
+    assert re.search(r"PSNR, best of 100.*\| 26.4 +\| 24.5 ", text)
+    assert re.search(r"LPIPS, VGG.*, best of 100.*\| 0.0321 +\| 0.05 ", text)
+    assert re.search(r"\| PSNR, dB ↑ .*\| – +\| – ", text)
+    assert "on BAIR with iVideoGPT's protocol" in text
+
+
+def test_unseen_scenes_have_a_published_row_for_each_family_of_that_table(make: Make) -> None:
+    families = ("roboscape", "genie", "irasim", "cogvideox")
+    unseen = replace(toy.result(0.0), label="unseen,unseen_camera", protocol=PROTOCOLS["unseen"].described())
+    groups = [make(name, with_model(unseen, name)) for name in families]
+    text = as_markdown(compare(read_groups(groups, "unseen,unseen_camera")))
+    assert re.search(r"PSNR, dB ↑ .*\| 23.4049 +\| 21.6537 +\| 11.9085 +\| 18.5676 ", text)
+    assert re.search(r"depth AbsRel, branch, median ↓ .*\| 0.2552 +\| 0.3259 +\| 0.6063 +\| 0.4577 ", text)
 
 
 def row_of(clip: ComparedClip) -> int:

@@ -106,20 +106,21 @@ register(
             "our introduced physics representations."
         ),
         place="authors' answers, reviewer XShs",
-        arms=(
-            Arm("RoboScape", rate=RATES["RoboScape"], published=published_by_metric("RoboScape", "unseen")),
-            Arm(
-                "Genie",
-                model="genie",
-                equal="seconds",
-                rate=RATES["Genie"],
-                published=published_by_metric("Genie", "unseen"),
-            ),
+        arms=tuple(
+            replace(arm, rate=RATES[arm.name], published=published_by_metric(arm.name, "unseen"))
+            for arm in (
+                Arm("RoboScape"),
+                Arm("Genie", model="genie", equal="seconds"),
+                Arm("IRASim", preset="irasim", equal="seconds"),
+                Arm("CogVideoX", preset="cogvideox", equal="seconds"),
+            )
         ),
         comparisons=tuple(
-            Comparison(metric, "RoboScape", "Genie", measurement=name)
+            Comparison(metric, "RoboScape", other, measurement=name)
+            for other in ("Genie", "IRASim", "CogVideoX")
             for name in _PLACES.values()
             for metric in ("psnr", *ESTIMATED_DEPTH, "delta_psnr", "psnr_motion")
+            if (other, metric) != ("CogVideoX", "delta_psnr")  # CogVideoX has no actions
         ),
         rank=2,
         notes=(
