@@ -33,6 +33,9 @@ FAMILY_STEPS = {"irasim": (0.13, 0.34), "cogvideox": (0.85, 0.50), "ivideogpt": 
 # Seconds by which an imagined episode of Lift takes longer than a simulated one, on 2 cores of an Intel Ice Lake: each
 # of its 30 frames takes these families a whole video.
 FAMILY_EPISODES = {"irasim": 29.0, "ivideogpt": 3.4}
+# Seconds of a generated clip of 16 frames, by the seconds a frame of docs/results/baselines.md; 0.08 for others.
+FAMILY_VIDEOS = {"irasim": 0.30, "ivideogpt": 0.32}
+VIDEO = 0.08
 EVALUATION = 30.0  # seconds per evaluation
 LOCALISER = 0.106  # seconds per step of the localiser
 # Seconds per step of the depth estimator that learns from the clips, for frames of 64 pixels: 0.126 of processor time.

@@ -17,7 +17,7 @@ from rsjax.tools.studies.paper.claims.policies import Size
 from rsjax.tools.studies.paper.measurements import measure, measured, read_scores, seconds_of
 from tests.tools.policies.toy import demos
 
-NAMES = ("policy-learning", "policy-evaluation", "policy-improvement", "planning")
+NAMES = ("policy-learning", "policy-evaluation", "policy-improvement", "planning")  # and policy-data
 
 
 class Data:
@@ -97,6 +97,25 @@ def test_every_comparison_has_its_scores(tmp_path: Path, asked: dict[str, Any]) 
     assert (asked["starts"], asked["old"]) == (2 * 40, 10)
     assert found["planning", "mppi", "random"] == ([1, 1], [0, 0])
     assert found["planning", "cem", "random"] == ([0, 1], [0, 0]) and asked["plan"].episodes == 10
+
+
+def test_policies_learn_from_the_synthetic_video_of_every_family_with_actions(
+    tmp_path: Path, asked: dict[str, Any]
+) -> None:
+    claim = claims()["policy-data"]
+    assert [arm.name for arm in claim.arms] == ["RoboScape", "Genie", "iVideoGPT", "IRASim"]
+    run = Run(_with_clips(20), tmp_path / "cell", tmp_path / "data")
+    measure(run, "policies from synthetic video")
+    scores, reason = read_scores(run, "policies from synthetic video")
+    assert not reason
+    assert {name for each in claim.comparisons for name in (each.score, each.than_score)} < scores.keys()
+    assert scores == {"many": [0, 1], "both": [1, 1], "real": [1, 0]}
+    cells = ["synthetic-40", "real-40-synthetic-40", "real-40"]
+    assert asked["cells"] == [(name, "policies") for name in cells]
+    names = ("roboscape_tiny", "irasim_tiny")
+    ours, theirs = (seconds_of("policies from synthetic video", presets.get(name)) for name in names)
+    whole = seconds_of("policies learned", presets.get("roboscape_tiny"))
+    assert ours < theirs < whole
 
 
 def test_policies_from_real_clips_are_shared_by_the_cells_on_them(tmp_path: Path) -> None:
