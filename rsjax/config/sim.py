@@ -12,7 +12,9 @@ from rsjax.errors import did_you_mean
 CONTROLS = {
     "lift": 7,
     "metaworld": 4,
+    "rope": 7,
 }  # numbers of a control step: change of the pose (6-D, or position alone) and gripper
+ROPE_TASKS = ("rope", "rod")  # soft and rigid, alike in all else
 
 
 EXPERT = "expert"  # the scripted expert, the only one of the recipes that Meta-World has too
@@ -29,7 +31,7 @@ class SimConfig:
     episodes: int = 200  # those of the test split included; more where training clips are learned by heart
     test_episodes: int = 20  # the last ones collected, never used in training
     frames: int = 16  # of a clip, as in the paper
-    # Control steps between frames, at 20 Hz in lift and 80 Hz in metaworld; a frame's action is their concatenation.
+    # Control steps between frames, at 20 Hz, and 80 Hz in metaworld; a frame's action is their concatenation.
     control_steps: int = 4
     image_size: int = 64  # pixels a side; 256 in the paper
     camera: str = "agentview"  # near: our own, in which objects and gripper are larger
@@ -38,9 +40,10 @@ class SimConfig:
     # objects: up to half on a grid, the others on the objects and the arm's moving links, found by segmentation.
     track_points: Literal["grid", "objects"] = "grid"
     seed: int = 0  # of the scenes and the motions
-    env: Literal["lift", "metaworld"] = "lift"  # lift: one cube to lift; metaworld: up to 50 tasks
-    tasks: tuple[str, ...] = ()  # of Meta-World; none: the 45 training tasks of its ML45 benchmark
-    unseen_tasks: tuple[str, ...] = ()  # for the protocol "unseen"; none: the 5 tasks that ML45 holds out
+    # lift: one cube to lift; metaworld: up to 50 tasks; rope: a rope and a rigid rod
+    env: Literal["lift", "metaworld", "rope"] = "lift"
+    tasks: tuple[str, ...] = ()  # none: the 45 training tasks of Meta-World's ML45 benchmark, or rope and rod
+    unseen_tasks: tuple[str, ...] = ()  # for the protocol "unseen"; none: in Meta-World the 5 that ML45 holds out
     # What the training episodes show, each with its share: expert, grasps, pushes, slips, driving, novices, or
     # recorded:PATH, such as expert=0.6 grasps=0.4. The test split is the expert's, whatever the recipe.
     recipe: tuple[str, ...] = later((EXPERT,))
@@ -61,10 +64,11 @@ class SimConfig:
         for field, tasks in named.items():
             for task in tasks:
                 require(
-                    self.env == "metaworld",
+                    self.env != "lift",
                     f"sim.{field} names {task!r}, but sim.env is {self.env}, which has one task",
                 )
-                require(task in TASKS, f"sim.{field} names {task!r}, no task of Meta-World{did_you_mean(task, TASKS)}")
+                scene, known = {"metaworld": ("Meta-World", TASKS), "rope": ("rope", ROPE_TASKS)}[self.env]
+                require(task in known, f"sim.{field} names {task!r}, no task of {scene}{did_you_mean(task, known)}")
         require(self.env != "metaworld" or self.camera != "agentview", _NO_AGENTVIEW)
         both = sorted(set(self.train_tasks) & set(self.held_out_tasks))
         require(
@@ -98,13 +102,14 @@ class SimConfig:
     @property
     def train_tasks(self) -> tuple[str, ...]:
         """The tasks of the train and test splits; empty in lift, which has only one task."""
-        return (self.tasks or ML45) if self.env == "metaworld" else ()
+        return self.tasks or {"lift": (), "metaworld": ML45, "rope": ROPE_TASKS}[self.env]
 
     @property
     def held_out_tasks(self) -> tuple[str, ...]:
         """The tasks that training never sees."""
-        chosen = self.unseen_tasks or tuple(task for task in ML45_UNSEEN if task not in self.tasks)
-        return chosen if self.env == "metaworld" else ()
+        if self.env != "metaworld":
+            return self.unseen_tasks
+        return self.unseen_tasks or tuple(task for task in ML45_UNSEEN if task not in self.tasks)
 
     @property
     def action_dim(self) -> int:

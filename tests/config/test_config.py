@@ -196,6 +196,7 @@ def test_a_stored_value_of_another_type_is_refused_by_name(path: str, value: Any
         ("model.sample", {"window_stride": 6}, "model.sample.window_stride is 6 of 6 positions"),
         ("eval", {"clips": 1}, "eval.clips is 1 of sim.test_episodes 2"),
         ("eval", {"batch_size": 0}, "eval.batch_size is 0"),
+        ("sim", {"env": "rope", "tasks": ("string",)}, "sim.tasks names 'string', no task of rope"),
         ("sim", {"recipe": ()}, "sim.recipe is empty; name at least one of expert, grasps"),
         ("sim", {"recipe": ("grasp=0.5",)}, "sim.recipe names 'grasp'; did you mean 'grasps'?"),
         ("sim", {"recipe": ("grasps=some",)}, "sim.recipe has 'grasps=some'; a share must be a number above 0"),

@@ -14,7 +14,7 @@ from rsjax.config import Config
 from rsjax.data.normalization import Normalization
 from rsjax.tools.play.messages import Refused
 from rsjax.tools.policies.worlds.actions import action_range
-from rsjax.tools.sim.lift import STEP, TURN
+from rsjax.tools.sim.panda import STEP, TURN
 
 MOST = 1e9  # of a number in an action; far smaller ones are clipped already
 
@@ -97,7 +97,7 @@ def controls_of_run(config: Config, normalization: Normalization, names: Sequenc
         names: names of a recording's dimensions, such as "gripper (held)"; "(held)" for a dimension without a name.
     """
     if config.data is None:
-        return Controls(_LIFT if config.sim.env == "lift" else _METAWORLD, config.sim.control_steps)
+        return Controls(_METAWORLD if config.sim.env == "metaworld" else _PANDA, config.sim.control_steps)
     limits = action_range(config, normalization)
     mean = normalization.action_mean
     each = []
@@ -121,7 +121,7 @@ def _axis(name: str, label: str, unit: str, scale: float) -> Control:
 
 
 _GRIPPER = Control("gripper", "gripper: open, closed", -1.0, 1.0, -1.0, "toggle", "", None)
-_LIFT = (
+_PANDA = (
     _axis("x", "away from the robot's base, back", "metres", STEP),
     _axis("y", "left, right", "metres", STEP),
     _axis("z", "up, down", "metres", STEP),

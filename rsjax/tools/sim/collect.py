@@ -21,12 +21,12 @@ from rsjax.data.store import Record, complete_key, decode, encode, encode_clip, 
 from rsjax.errors import UserError
 from rsjax.files import disk_guard, write_atomically
 from rsjax.processes import WorkerDied, count_cores, run_items
-from rsjax.tools.sim import expert, metaworld
-from rsjax.tools.sim.episode import EpisodePlan, Simulators, run_episode, source_name, task_of
+from rsjax.tools.sim import metaworld
+from rsjax.tools.sim.episode import ENVIRONMENTS, EpisodePlan, Simulators, run_episode, source_name, task_of
 from rsjax.tools.sim.gl import GLError, choose_gl
 from rsjax.tools.sim.recipes.plans import training_plans, versions
 
-RECIPES = {"lift": 7, "metaworld": 3}  # raise when the same configuration gives different episodes
+RECIPES = {"lift": 7, "metaworld": 3, "rope": 1}  # raise when the same configuration gives different episodes
 MAX_FAILURES = 0.1  # share of the episodes; more failures than this mean a broken installation
 Report = Callable[[int, int], None]  # called with (episodes done, episodes in all)
 
@@ -58,7 +58,7 @@ class Collection:
 
 def collection_key(config: SimConfig) -> str:
     """Returns the content key of the store that :func:`collect` makes."""
-    modes = {"lift": expert.MODES, "metaworld": metaworld.MODES}[config.env]
+    modes = ENVIRONMENTS[config.env].modes
     return content_key(config.env, RECIPES[config.env], modes, config, *versions(config))
 
 

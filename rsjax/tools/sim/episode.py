@@ -1,7 +1,7 @@
-"""Simulates one episode, in either simulator, as a clip with exact depth and tracks."""
+"""Simulates one episode, in any of the simulators, as a clip with exact depth and tracks."""
 
 import importlib.metadata
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -12,8 +12,7 @@ from rsjax.clip import Clip
 from rsjax.config import SimConfig, to_dict
 from rsjax.config.metaworld import SIMPLE
 from rsjax.config.sim import CONTROLS
-from rsjax.tools.sim import lift, metaworld
-from rsjax.tools.sim.expert import SIMPLE as SIMPLE_MODES
+from rsjax.tools.sim import expert, lift, metaworld, panda, rope
 from rsjax.tools.sim.render import Camera, View
 from rsjax.tools.sim.scenery import SEEN, Change, Variation, draw_variation
 from rsjax.tools.sim.tracks import Snapshot, grid_pixels, object_pixels, track
@@ -91,7 +90,7 @@ class EpisodePlan:
         name: name of the episode's file while a store is collected.
         episode: its number; together with the seed it determines start, noise and everything that no other field sets.
             Episodes with one number and different manners start alike.
-        task: the Meta-World task; empty in Lift.
+        task: the task; empty in Lift.
         change: what looks different from training.
         replay: actions that replace the expert's.
         manner: that of the expert; None: one is drawn.
@@ -107,6 +106,43 @@ class EpisodePlan:
     seed: int | None = None
 
 
+@dataclass(frozen=True)
+class Environment:
+    """A value of ``sim.env``.
+
+    Attributes:
+        open: opens the simulator of a task with a camera and an image size.
+        source: names the simulator and its robot.
+        package: the package of the simulator.
+        control_hz: control steps a second.
+        modes: the probability of each mode of its scripted expert.
+        simple: the modes that a curriculum begins with; the others are difficult. In Meta-World tasks decide.
+    """
+
+    open: Callable[[str, str, int], Simulator]
+    source: str
+    package: str
+    control_hz: int
+    modes: Mapping[str, float]
+    simple: tuple[str, ...] = ()
+
+
+ENVIRONMENTS = {
+    "lift": Environment(
+        lambda task, camera, size: lift.LiftSim(camera, size),
+        "robosuite/Lift/Panda",
+        "robosuite",
+        panda.CONTROL_HZ,
+        expert.MODES,
+        expert.SIMPLE,
+    ),
+    "metaworld": Environment(
+        metaworld.MetaworldSim, "metaworld/Sawyer", "metaworld", metaworld.CONTROL_HZ, metaworld.MODES
+    ),
+    "rope": Environment(rope.RopeSim, "robosuite/Rope/Panda", "robosuite", panda.CONTROL_HZ, rope.MODES, rope.SIMPLE),
+}
+
+
 class Simulators:
     """The simulators of all tasks, of which one is open at a time. Call :meth:`close` when done."""
 
@@ -120,10 +156,7 @@ class Simulators:
         if self._sim is None or task != self._task:
             self.close()
             config = self._config
-            if config.env == "lift":
-                self._sim = lift.LiftSim(config.camera, config.image_size)
-            else:
-                self._sim = metaworld.MetaworldSim(task, config.camera, config.image_size)
+            self._sim = ENVIRONMENTS[config.env].open(task, config.camera, config.image_size)
             self._task = task
         return self._sim
 
@@ -162,11 +195,11 @@ def run_episode(sim: Simulator, config: SimConfig, plan: EpisodePlan) -> Clip:
         looks = SEEN
     sim.reset(int(rng.integers(2**32)), looks)
     if plan.manner:
-        expert = plan.manner.expert(rng)
+        policy = plan.manner.expert(rng)
     else:
-        expert = sim.draw_expert(rng)
-    act = expert.act
-    manner = to_dict(expert.manner)
+        policy = sim.draw_expert(rng)
+    act = policy.act
+    manner = to_dict(policy.manner)
     if plan.replay:
         act = _replayed(plan.replay, CONTROLS[config.env], np.random.default_rng([seed, episode, 4]))
         manner = plan.replay.expert or manner
@@ -194,12 +227,12 @@ def run_episode(sim: Simulator, config: SimConfig, plan: EpisodePlan) -> Clip:
     provenance = _origin(config, seed, episode) | {
         "expert": manner,
         "objects": _in_the_image(shots[0].camera, places, sim.object_width) | {"height": heights, "opening": openings},
-        "versions": {name: importlib.metadata.version(name) for name in _packages(config)},
+        "versions": {name: importlib.metadata.version(name) for name in (ENVIRONMENTS[config.env].package, "mujoco")},
     }
-    if plan.task:
+    if config.env == "metaworld":
         simple = plan.task in SIMPLE
     else:
-        simple = manner["mode"] in SIMPLE_MODES
+        simple = manner["mode"] in ENVIRONMENTS[config.env].simple
     if simple:
         provenance["difficulty"] = "simple"
     else:
@@ -227,13 +260,7 @@ def clip_seed(provenance: dict[str, Any]) -> int:
 
 def source_name(config: SimConfig) -> str:
     """Returns the name of the simulator and its robot."""
-    if config.env == "lift":
-        return "robosuite/Lift/Panda"
-    return "metaworld/Sawyer"
-
-
-def _packages(config: SimConfig) -> tuple[str, ...]:
-    return ("robosuite" if config.env == "lift" else "metaworld", "mujoco")
+    return ENVIRONMENTS[config.env].source
 
 
 def _origin(config: SimConfig, seed: int, episode: int) -> dict[str, Any]:
@@ -242,7 +269,7 @@ def _origin(config: SimConfig, seed: int, episode: int) -> dict[str, Any]:
         "seed": seed,
         "episode": episode,
         "camera": config.camera,
-        "control_hz": 20 if config.env == "lift" else metaworld.CONTROL_HZ,
+        "control_hz": ENVIRONMENTS[config.env].control_hz,
     }
 
 

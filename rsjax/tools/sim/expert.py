@@ -20,17 +20,24 @@ TURN_GAIN = 1.5  # action per radian
 
 
 @dataclass(frozen=True)
-class State:
-    """The expert's observation: positions in metres in the world, yaws in radians about the vertical.
+class Arm:
+    """What every expert of the Panda arm observes: positions in metres in the world, yaws in radians.
 
     Attributes:
         gripper: position of the gripper.
         goal: position to which the actions so far have sent it.
+        gripper_yaw: its turn about the vertical.
     """
 
     gripper: Float[np.ndarray, " 3"]
     goal: Float[np.ndarray, " 3"]
     gripper_yaw: float
+
+
+@dataclass(frozen=True)
+class State(Arm):
+    """The observation of Lift's expert: the arm, and the cube's position and yaw."""
+
     cube: Float[np.ndarray, " 3"]
     cube_yaw: float
 

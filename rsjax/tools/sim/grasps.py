@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rsjax.tools.sim.expert import CLOSE, OPEN
-from rsjax.tools.sim.lift import TURN
+from rsjax.tools.sim.panda import TURN
 from rsjax.tools.sim.recipes.script import Moves, Scripted, See, go, towards
 
 TURNING = 0.5  # bound on the action of turning

@@ -72,10 +72,10 @@ def _config(clips: Store) -> SimConfig:
 def _plan(config: SimConfig, name: str, record: Record) -> EpisodePlan:
     """Returns the plan of a clip's second take, with the same change of appearance if the clip has one."""
     origin = record["provenance"]
-    if config.env == "metaworld":
-        task = record["task"]
-    else:
+    if config.env == "lift":
         task = ""
+    else:
+        task = record["task"]
     change = origin.get("unseen", {}).get("what")
     replay = Replay(record["actions"], JITTER, origin["expert"])
     return EpisodePlan(name, origin["episode"], task, change, replay, seed=origin["seed"])

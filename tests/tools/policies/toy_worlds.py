@@ -11,7 +11,7 @@ from rsjax.clip import Video
 from rsjax.files import write_json
 from rsjax.tools.policies.config import toy as toy_size
 from rsjax.tools.policies.diffusion_policy import DiffusionPolicy
-from rsjax.tools.policies.worlds.actions import LIFT_UNIT, ActionRange
+from rsjax.tools.policies.worlds.actions import PANDA_UNIT, ActionRange
 from rsjax.tools.policies.worlds.model_world import ModelWorld
 from rsjax.tools.policies.worlds.simulator_world import SimulatorWorld
 from tests.tools.policies.toy import CONTROLS, RANGE, SIZE, WIDTH, picture
@@ -118,7 +118,7 @@ def trained_like(model: Any, params: Any, uses_depth: bool = False) -> Any:
 
 def action_range(most: float) -> ActionRange:
     high = np.full(CONTROLS * WIDTH, most, np.float32)
-    return ActionRange(-high, high, LIFT_UNIT)
+    return ActionRange(-high, high, PANDA_UNIT)
 
 
 def simulated(count: int) -> SimulatorWorld:

@@ -15,7 +15,7 @@ from rsjax.data.store import complete_key, encode, encode_clip, open_store
 from rsjax.files import FileError, making
 from rsjax.processes import WorkerDied
 from rsjax.tools.sim import collect as collect_module
-from rsjax.tools.sim import lift as lift_module
+from rsjax.tools.sim import panda as panda_module
 from rsjax.tools.sim.collect import CollectError, collect, collection_key
 from rsjax.tools.sim.episode import EpisodePlan, Simulators, run_episode
 from rsjax.tools.sim.lift import LiftSim
@@ -62,7 +62,7 @@ def test_actions_are_what_led_to_the_frame(sim: LiftSim) -> None:
 
 def test_computing_each_state_once_changes_no_physics(sim: LiftSim, monkeypatch: pytest.MonkeyPatch) -> None:
     clip = run_episode(sim, CONFIG, plan(2))
-    monkeypatch.setattr(lift_module, "_compute_once", lambda sim: None)
+    monkeypatch.setattr(panda_module, "compute_states_once", lambda sim: None)
     with LiftSim(image_size=64) as plain:
         other = run_episode(plain, CONFIG, plan(2))
     np.testing.assert_allclose(clip.actions, other.actions, atol=1e-5)

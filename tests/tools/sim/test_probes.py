@@ -11,7 +11,8 @@ from rsjax.tools.sim.drives import SMOOTH, WORKSPACE, Drive
 from rsjax.tools.sim.episode import EpisodePlan, Replay, clip_seed, run_episode, source_name
 from rsjax.tools.sim.expert import CLOSE, State
 from rsjax.tools.sim.grasps import STEPS, Grasp
-from rsjax.tools.sim.lift import STEP, LiftSim
+from rsjax.tools.sim.lift import LiftSim
+from rsjax.tools.sim.panda import STEP
 from rsjax.tools.sim.probes import DRIVES, GRASPS, OFFSETS, collect_probes
 from rsjax.tools.sim.unseen import UNITS
 

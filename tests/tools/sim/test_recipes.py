@@ -15,7 +15,8 @@ from rsjax.tools.sim.collect import collect, collection_key
 from rsjax.tools.sim.contacts import collect_contacts, contact_splits
 from rsjax.tools.sim.episode import EpisodePlan, clip_seed, run_episode
 from rsjax.tools.sim.expert import OPEN, State
-from rsjax.tools.sim.lift import REACH, STEP, LiftSim
+from rsjax.tools.sim.lift import LiftSim
+from rsjax.tools.sim.panda import REACH, STEP
 from rsjax.tools.sim.recipes.grasps import GROUP
 from rsjax.tools.sim.recipes.plans import RECIPES, held_out_plans, scripted, training_plans
 

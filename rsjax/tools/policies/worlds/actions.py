@@ -14,7 +14,7 @@ from rsjax.models.trained import ShapeError, as_array
 
 OutOfRange: TypeAlias = Literal["clip", "refuse"]
 SPREAD = 5.0  # actions of recordings are clipped to this many standard deviations around the mean
-LIFT_UNIT = "6-D change of the goal pose and gripper (+1 closes) for each control step, from -1 to 1"
+PANDA_UNIT = "6-D change of the goal pose and gripper (+1 closes) for each control step, from -1 to 1"
 
 
 class ActionError(UserError):
@@ -117,8 +117,8 @@ def action_range(config: Config, normalization: Normalization) -> ActionRange:
         low = (mean - SPREAD * std).astype(np.float32)
         high = (mean + SPREAD * std).astype(np.float32)
         return ActionRange(low, high, "in the recording's units, as the clips' actions")
-    if config.sim.env == "lift":
-        unit = LIFT_UNIT
-    else:
+    if config.sim.env == "metaworld":
         unit = "controls of the simulator, from -1 to 1"
+    else:
+        unit = PANDA_UNIT
     return ActionRange(np.full(width, -1, np.float32), np.full(width, 1, np.float32), unit)

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 
 from rsjax.config import SimConfig, content_key, require
 from rsjax.progress import note
-from rsjax.tools.policies.worlds.actions import LIFT_UNIT, ActionRange
+from rsjax.tools.policies.worlds.actions import PANDA_UNIT, ActionRange
 from rsjax.tools.policies.worlds.world import Episode, WorldState
 from rsjax.tools.sim.episode import Simulator
 from rsjax.tools.sim.expert import State
@@ -47,7 +47,7 @@ class SimulatorWorld:
         self.diverged: dict[int, ArithmeticError] = {}
         self._controls = (control_steps, width)
         ones = np.ones(control_steps * width, np.float32)
-        self.actions = ActionRange(-ones, ones, LIFT_UNIT)
+        self.actions = ActionRange(-ones, ones, PANDA_UNIT)
         self._views: list[Any] = []
         self._success: list[bool] = []
 

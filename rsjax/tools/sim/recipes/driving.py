@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rsjax.tools.sim.expert import CLOSE, OPEN
-from rsjax.tools.sim.lift import REACH
+from rsjax.tools.sim.panda import REACH
 from rsjax.tools.sim.recipes.script import Moves, Scripted, See, rest, towards
 
 STYLES = ("strokes", "curves", "edges", "strokes", "visits")

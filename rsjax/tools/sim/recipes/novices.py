@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from rsjax.tools.sim.expert import CLOSE, OPEN
+from rsjax.tools.sim.expert import CLOSE, OPEN, yaw_action
 from rsjax.tools.sim.recipes.script import Moves, Scripted, See, stay, towards
 
 PLAN = 8  # control steps between two looks at the cube, as between a Diffusion Policy's plans
@@ -71,7 +71,7 @@ def reach(manner: NoviceManner, rng: np.random.Generator, see: See) -> Moves:
     for _ in range(6):
         seen = see().cube + wrong + (1 - manner.skill) * JITTER * rng.standard_normal(3) * np.array([1, 1, 0.3])
         for _ in range(PLAN):
-            yield towards(see(), seen + np.array([0, 0, height]), OPEN, manner.speed, turn=True)
+            yield towards(see(), seen + np.array([0, 0, height]), OPEN, manner.speed, yaw_action(see()))
             apart = np.abs(see().gripper - seen)
             if height == 0.0 and apart[:2].max() < 0.02 and apart[2] < 0.012 + manner.early:
                 return

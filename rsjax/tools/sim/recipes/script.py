@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from jaxtyping import Float
 
-from rsjax.tools.sim.expert import GAIN, OPEN, State, next_noise, yaw_action
+from rsjax.tools.sim.expert import GAIN, OPEN, Arm, State, next_noise, yaw_action
 
 See: TypeAlias = Callable[[], State]  # returns the current state
 Moves: TypeAlias = Iterator[Float[np.ndarray, " 7"]]  # the action of each control step
@@ -34,9 +34,9 @@ class Scripted:
         self._noise = np.zeros(6)
         self._rng = rng
         self._last = rest(OPEN)
-        self._state: State
+        self._state: Any
 
-    def act(self, state: State) -> Float[np.ndarray, " 7"]:
+    def act(self, state: Any) -> Float[np.ndarray, " 7"]:
         """Returns the next action."""
         self._state = state
         action = next(self._moves, rest(self._last[6]))
@@ -51,18 +51,17 @@ def rest(finger: float) -> Float[np.ndarray, " 7"]:
 
 
 def towards(
-    state: State, point: Float[np.ndarray, " 3"], finger: float, speed: float = 1.0, turn: bool = False
+    state: Arm, point: Float[np.ndarray, " 3"], finger: float, speed: float = 1.0, turn: float = 0.0
 ) -> Float[np.ndarray, " 7"]:
     """Returns the action that moves the gripper's goal towards a point.
 
     Args:
         speed: bound on each number of the translation, at most 1.
-        turn: whether to turn the fingers parallel to the cube's sides.
+        turn: the number that turns the gripper about the vertical.
     """
     action = rest(finger)
     action[:3] = np.clip(GAIN * (point - state.goal), -speed, speed)
-    if turn:
-        action[5] = yaw_action(state)
+    action[5] = turn
     return action
 
 
@@ -72,7 +71,9 @@ def stay(finger: float, steps: int) -> Moves:
         yield rest(finger)
 
 
-def go(see: See, point: Float[np.ndarray, " 3"], finger: float, speed: float, steps: int, near: float = 0.0) -> Moves:
+def go(
+    see: Callable[[], Arm], point: Float[np.ndarray, " 3"], finger: float, speed: float, steps: int, near: float = 0.0
+) -> Moves:
     """Moves towards a point for at most ``steps`` steps, until the gripper is ``near`` it along each axis."""
     for _ in range(steps):
         if np.abs(see().gripper - point).max() < near:
@@ -86,4 +87,4 @@ def hover(see: See, above: Float[np.ndarray, " 3"], speed: float, steps: int, ne
         point = see().cube + above
         if np.abs(see().gripper - point).max() < near:
             return
-        yield towards(see(), point, OPEN, speed, turn=True)
+        yield towards(see(), point, OPEN, speed, yaw_action(see()))

@@ -9,7 +9,7 @@ from rsjax.config import ComponentConfig, Config, ConfigError, CurriculumStageCo
 from rsjax.config.config_fields import config_fields, with_values
 from rsjax.config.sim import EXPERT
 from rsjax.tools.pipeline.run import Run
-from rsjax.tools.sim import expert
+from rsjax.tools.sim.episode import ENVIRONMENTS
 from rsjax.tools.studies.ablation.grid import OTHER_SEEDS, SEED, Value, cell_name
 from rsjax.tools.studies.paper import budget
 from rsjax.tools.studies.paper.budget import Scale
@@ -240,8 +240,9 @@ def _stages(arm: Arm, config: Config) -> tuple[CurriculumStageConfig, ...]:
 
 
 def _simple_share(sim: SimConfig) -> float:
-    """Returns the expected share of simple clips, from the tasks, which take turns, or the modes of Lift's expert."""
+    """Returns the expected share of simple clips, from the tasks, which take turns, or the modes of the expert."""
     tasks = sim.train_tasks
-    if tasks:
+    if sim.env == "metaworld":
         return sum(task in metaworld.SIMPLE for task in tasks) / len(tasks)
-    return sim.shares.get(EXPERT, 0.0) * sum(expert.MODES[mode] for mode in expert.SIMPLE)
+    environment = ENVIRONMENTS[sim.env]
+    return sim.shares.get(EXPERT, 0.0) * sum(environment.modes[mode] for mode in environment.simple)
