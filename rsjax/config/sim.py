@@ -13,8 +13,10 @@ CONTROLS = {
     "lift": 7,
     "metaworld": 4,
     "rope": 7,
+    "tabletop": 7,
 }  # numbers of a control step: change of the pose (6-D, or position alone) and gripper
 ROPE_TASKS = ("rope", "rod")  # soft and rigid, alike in all else
+TABLETOP_TASKS = ("cube", "can", "bread", "milk")  # which of the objects on the table goes into the basket
 
 
 EXPERT = "expert"  # the scripted expert, the only one of the recipes that Meta-World has too
@@ -40,9 +42,9 @@ class SimConfig:
     # objects: up to half on a grid, the others on the objects and the arm's moving links, found by segmentation.
     track_points: Literal["grid", "objects"] = "grid"
     seed: int = 0  # of the scenes and the motions
-    # lift: one cube to lift; metaworld: up to 50 tasks; rope: a rope and a rigid rod
-    env: Literal["lift", "metaworld", "rope"] = "lift"
-    tasks: tuple[str, ...] = ()  # none: the 45 training tasks of Meta-World's ML45 benchmark, or rope and rod
+    # lift: one cube to lift; metaworld: up to 50 tasks; rope: a rope and a rigid rod; tabletop: four objects, a basket
+    env: Literal["lift", "metaworld", "rope", "tabletop"] = "lift"
+    tasks: tuple[str, ...] = ()  # none: the 45 training tasks of Meta-World's ML45, or all of another scene
     unseen_tasks: tuple[str, ...] = ()  # for the protocol "unseen"; none: in Meta-World the 5 that ML45 holds out
     # What the training episodes show, each with its share: expert, grasps, pushes, slips, driving, novices, or
     # recorded:PATH, such as expert=0.6 grasps=0.4. The test split is the expert's, whatever the recipe.
@@ -67,7 +69,8 @@ class SimConfig:
                     self.env != "lift",
                     f"sim.{field} names {task!r}, but sim.env is {self.env}, which has one task",
                 )
-                scene, known = {"metaworld": ("Meta-World", TASKS), "rope": ("rope", ROPE_TASKS)}[self.env]
+                known = {"metaworld": TASKS, "rope": ROPE_TASKS, "tabletop": TABLETOP_TASKS}[self.env]
+                scene = {"metaworld": "Meta-World"}.get(self.env, self.env)
                 require(task in known, f"sim.{field} names {task!r}, no task of {scene}{did_you_mean(task, known)}")
         require(self.env != "metaworld" or self.camera != "agentview", _NO_AGENTVIEW)
         both = sorted(set(self.train_tasks) & set(self.held_out_tasks))
@@ -102,7 +105,7 @@ class SimConfig:
     @property
     def train_tasks(self) -> tuple[str, ...]:
         """The tasks of the train and test splits; empty in lift, which has only one task."""
-        return self.tasks or {"lift": (), "metaworld": ML45, "rope": ROPE_TASKS}[self.env]
+        return self.tasks or {"metaworld": ML45, "rope": ROPE_TASKS, "tabletop": TABLETOP_TASKS}.get(self.env, ())
 
     @property
     def held_out_tasks(self) -> tuple[str, ...]:

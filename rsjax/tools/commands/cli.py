@@ -30,7 +30,7 @@ FIRST_FIELDS = {
     "sim.test-episodes": "Episodes of the test split.",
     "sim.seed": "Seed of the simulated episodes.",
     "sim.recipe": "What training episodes show, with shares: expert=0.6 grasps=0.4 (docs/simulators.md).",
-    "sim.env": "The simulator: lift, metaworld or rope (docs/simulators.md).",
+    "sim.env": "The simulator: lift, metaworld, rope or tabletop (docs/simulators.md).",
     "sim.tasks": "Tasks of Meta-World to train on, such as reach drawer-open.",
     "tokenizer-train.steps": "Training steps of the tokenizer.",
     "tokenizer-train.batch-size": "Clips of a batch, over all devices.",

@@ -6,7 +6,8 @@ action follows the last frame.
 """
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -38,6 +39,7 @@ LAYOUTS: dict[str, type[LayoutV30 | LayoutV21]] = {"v3.0": LayoutV30, "v2.1": La
 CONTROLS = ("delta_x", "delta_y", "delta_z", "delta_roll", "delta_pitch", "delta_yaw", "gripper")  # of simulated Lift
 # Names of a constant state's numbers; from one number LeRobot would make (B, T), but its policies want (B, T, D).
 ZEROS = ("zero_0", "zero_1")
+STATE = "observation.state"
 OPENPI_HORIZON = 50  # action_horizon of Pi0Config
 MOST_PADDING = 0.25  # share of action targets that is acceptable
 
@@ -92,6 +94,18 @@ def export_lerobot(
     If a world model generated some of the clips, ``meta/provenance.json`` lists these episodes. Rows have the columns
     ``next.success``, ``next.reward`` and ``next.done`` if the store knows which clips succeed.
     """
+    with new_data_set(out) as building:
+        return _write(store, building, options, report or (lambda done, total: None))
+
+
+@contextmanager
+def new_data_set(out: Path) -> Iterator[Path]:
+    """Yields the directory in which a data set is built, and moves it to ``out`` if all goes well.
+
+    Raises:
+        UserError: ``out`` exists.
+        FileError: the disk is full, or ``out`` cannot be written.
+    """
     if out.exists():
         raise UserError(f"{out}: exists; choose another place for the data set, or move it away")
     building = out.with_name(f"{out.name}.building")
@@ -99,11 +113,10 @@ def export_lerobot(
         shutil.rmtree(building, ignore_errors=True)
         building.mkdir(parents=True)
         try:
-            info = _write(store, building, options, report or (lambda done, total: None))
+            yield building
             replace_directory(building, out)
         finally:
             shutil.rmtree(building, ignore_errors=True)
-    return info
 
 
 def padding(frames: int, horizon: int) -> float:
@@ -147,8 +160,8 @@ def _write(store: Store, root: Path, options: LeRobotOptions, report: Callable[[
         for _, clip in readable(store.source(name)):
             if layout is None:
                 layout = _layout(store, clip, root, options)
-            episode = _episode(clip, layout.features, options.state)
-            if episode.rgb.shape[1:] != (layout.video.size, layout.video.size, 3):
+            episode = _episode(clip, layout)
+            if clip["rgb"].shape[1:] != (layout.video.size, layout.video.size, 3):
                 raise StoreError(f"{store.path}: has clips of several sizes; export them from stores of their own")
             if not options.fps and not keeps_rate(clip, store.manifest, layout.video.fps):
                 rate = frame_rate(clip, store.manifest)
@@ -169,7 +182,7 @@ def _write(store: Store, root: Path, options: LeRobotOptions, report: Callable[[
         mark = {"generated_episodes": generated, "episodes": layout.episodes, "note": GENERATED_MARK}
         write_json(root / "meta" / PROVENANCE, mark)
     if len(cameras) > 1:
-        note(f"{store.path}: has clips of the cameras {', '.join(cameras)}; all are in {layout.camera}")
+        note(f"{store.path}: has clips of the cameras {', '.join(cameras)}; all are in {layout.cameras[0]}")
     write_json(root / "meta" / EXPORTED, {"store": str(store.manifest.get("key")), "split": options.split})
     return layout.finish({"codebase_version": options.version, "robot_type": options.robot, "splits": splits})
 
@@ -186,9 +199,15 @@ def _layout(store: Store, clip: Record, root: Path, options: LeRobotOptions) -> 
         )
     fps = float(video_rate(fps))  # timestamps have to be those of the frames, even in a long video of many episodes
     width = clip["actions"].shape[1]
-    states = {"zeros": ZEROS, "command": _names(store, width), "none": None}[options.state]
+    names = _names(store, width)
+    columns: dict[str, Sequence[str]] = {}
+    if options.state == "zeros":
+        columns[STATE] = ZEROS
+    elif options.state == "command":
+        columns[STATE] = names
+    columns["action"] = names
     video = VideoSettings(options.codec, options.crf, fps, size)
-    features = describe_features(video, _camera(clip), _names(store, width), states, knows_success(store))
+    features = describe_features(video, [f"observation.images.{_camera(clip)}"], columns, knows_success(store))
     return LAYOUTS[options.version](root, video, features)
 
 
@@ -204,15 +223,14 @@ def _names(store: Store, width: int) -> list[str]:
     return [f"action_{number}" for number in range(width)]
 
 
-def _episode(clip: Record, features: dict[str, Any], state: str) -> LeRobotEpisode:
+def _episode(clip: Record, layout: LayoutV30 | LayoutV21) -> LeRobotEpisode:
     actions = clip["actions"]
     columns: dict[str, Shaped[np.ndarray, "T ..."]] = {"action": np.concatenate([actions[1:], actions[-1:]])}
-    if "observation.state" in features:
-        zeros = np.zeros((len(actions), len(ZEROS)), np.float32)
-        if state == "command":
-            columns["observation.state"] = actions
-        else:
-            columns["observation.state"] = zeros
-    if "next.success" in features:
+    state = layout.features.get(STATE)
+    if state is not None and state["names"] == list(ZEROS):
+        columns[STATE] = np.zeros((len(actions), len(ZEROS)), np.float32)
+    elif state is not None:
+        columns[STATE] = actions
+    if "next.success" in layout.features:
         columns |= outcome_columns(clip["success"])
-    return LeRobotEpisode(clip["rgb"], columns, str(clip["task"]))
+    return LeRobotEpisode({layout.cameras[0]: clip["rgb"]}, columns, str(clip["task"]))

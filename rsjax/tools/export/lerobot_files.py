@@ -105,19 +105,19 @@ Stats = dict[str, dict[str, np.ndarray]]  # feature → min, max, mean, std, cou
 
 
 def describe_features(
-    video: VideoSettings, camera: str, action: Sequence[str], state: Sequence[str] | None, outcome: bool = False
+    video: VideoSettings, cameras: Sequence[str], columns: Mapping[str, Sequence[str]], outcome: bool = False
 ) -> dict[str, dict[str, Any]]:
-    """Returns the ``features`` of ``info.json``: one camera, the action, a state if there is one, and row counters.
+    """Returns the ``features`` of ``info.json``: the cameras, the columns of numbers, and row counters.
 
     Args:
+        cameras: the names of the videos.
+        columns: by name, such as "action", the names of a column's numbers.
         outcome: whether rows say what their action led to.
     """
     pictures = {"dtype": "video", "shape": [video.size, video.size, 3], "names": ["height", "width", "channels"]}
-    features: dict[str, dict[str, Any]] = {f"observation.images.{camera}": pictures | {"info": video.describe()}}
-    numbers = {"observation.state": state, "action": action}
-    for name, names in numbers.items():
-        if names is not None:
-            features[name] = {"dtype": "float32", "shape": [len(names)], "names": list(names)}
+    features: dict[str, dict[str, Any]] = {name: pictures | {"info": video.describe()} for name in cameras}
+    for name, names in columns.items():
+        features[name] = {"dtype": "float32", "shape": [len(names)], "names": list(names)}
     single = COUNTERS
     if outcome:
         single = OUTCOME | COUNTERS
@@ -216,12 +216,12 @@ class LeRobotEpisode:
     """One episode to write.
 
     Attributes:
-        rgb: the episode's frames.
-        columns: its ``action`` and, if it has them, its ``observation.state`` and its outcome.
+        videos: the episode's frames by camera.
+        columns: its numbers by name, such as ``action``, ``observation.state`` and its outcome.
         task: in words.
     """
 
-    rgb: UInt8[np.ndarray, "T H W 3"]
+    videos: dict[str, UInt8[np.ndarray, "T H W 3"]]
     columns: dict[str, Shaped[np.ndarray, "T ..."]]
     task: str
 
@@ -236,14 +236,14 @@ class _Layout(ABC):
         self.root = root
         self.video = video
         self.features = features
-        self.camera = next(name for name, feature in features.items() if feature["dtype"] == "video")
+        self.cameras = [name for name, feature in features.items() if feature["dtype"] == "video"]
         self.episodes = self.rows = 0
         self.tasks: dict[str, int] = {}
         (root / "meta").mkdir()
 
     def add(self, episode: LeRobotEpisode) -> None:
         """Writes the next episode."""
-        count = len(episode.rgb)
+        count = len(episode.videos[self.cameras[0]])
         task = self.tasks.setdefault(episode.task, len(self.tasks))
         steps = np.arange(count)
         numbers = [
@@ -255,9 +255,9 @@ class _Layout(ABC):
         ]
         counters = zip(COUNTERS.items(), numbers, strict=True)
         columns = episode.columns | {name: values.astype(dtype) for (name, dtype), values in counters}
-        stats = {self.camera: picture_stats(episode.rgb)}
+        stats = {camera: picture_stats(episode.videos[camera]) for camera in self.cameras}
         stats |= {name: column_stats(values) for name, values in columns.items()}
-        self._write(episode, rows_table(columns), stats)
+        self._write(episode, count, rows_table(columns), stats)
         self.episodes = self.episodes + 1
         self.rows = self.rows + count
 
@@ -278,7 +278,7 @@ class _Layout(ABC):
         return info
 
     @abstractmethod
-    def _write(self, episode: LeRobotEpisode, table: pa.Table, stats: Stats) -> None: ...
+    def _write(self, episode: LeRobotEpisode, count: int, table: pa.Table, stats: Stats) -> None: ...
 
     @abstractmethod
     def _finish(self) -> dict[str, Any]:
@@ -291,15 +291,16 @@ class LayoutV21(_Layout):
     data_path = "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
     video_path = "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4"
 
-    def _write(self, episode: LeRobotEpisode, table: pa.Table, stats: Stats) -> None:
+    def _write(self, episode: LeRobotEpisode, count: int, table: pa.Table, stats: Stats) -> None:
         place = {"episode_chunk": self.episodes // CHUNK, "episode_index": self.episodes}
         data = self.root / self.data_path.format(**place)
         data.parent.mkdir(parents=True, exist_ok=True)
         pq.write_table(table, data)
-        video = VideoFile(self.root / self.video_path.format(video_key=self.camera, **place), self.video)
-        video.add(episode.rgb)
-        video.close()
-        row = {"episode_index": self.episodes, "tasks": [episode.task], "length": len(episode.rgb)}
+        for camera in self.cameras:
+            video = VideoFile(self.root / self.video_path.format(video_key=camera, **place), self.video)
+            video.add(episode.videos[camera])
+            video.close()
+        row = {"episode_index": self.episodes, "tasks": [episode.task], "length": count}
         self._append("episodes", row)
         self._append("episodes_stats", {"episode_index": self.episodes, "stats": plain_stats(stats, quantiles=False)})
 
@@ -310,7 +311,7 @@ class LayoutV21(_Layout):
     def _finish(self) -> dict[str, Any]:
         for task, number in self.tasks.items():
             self._append("tasks", {"task_index": number, "task": task})
-        return {"total_videos": self.episodes, "total_chunks": -(-self.episodes // CHUNK)}
+        return {"total_videos": self.episodes * len(self.cameras), "total_chunks": -(-self.episodes // CHUNK)}
 
 
 class LayoutV30(_Layout):
@@ -324,25 +325,27 @@ class LayoutV30(_Layout):
         super().__init__(root, video, features)
         self._data = _Tables(root, self.data_path)
         self._meta = _Tables(root, self.meta_path)
-        self._file: VideoFile | None = None
-        self._files = 0  # videos that are complete
+        self._open: dict[str, VideoFile] = {}  # by camera
+        self._files = 0  # videos of each camera that are complete
         self._stats: Stats = {}
         self._buffer: list[dict[str, Any]] = []
 
-    def _write(self, episode: LeRobotEpisode, table: pa.Table, stats: Stats) -> None:
-        if self._file is not None and self._file.bytes >= VIDEO_MEGABYTES * 2**20:
-            self._close_video()
-        if self._file is None:
-            path = self.video_path.format(video_key=self.camera, **_place(self._files))
-            self._file = VideoFile(self.root / path, self.video)
-        begins = self._file.frames
-        self._file.add(episode.rgb)
-        row: dict[str, Any] = {"episode_index": self.episodes, "tasks": [episode.task], "length": len(episode.rgb)}
+    def _write(self, episode: LeRobotEpisode, count: int, table: pa.Table, stats: Stats) -> None:
+        if any(file.bytes >= VIDEO_MEGABYTES * 2**20 for file in self._open.values()):
+            self._close_videos()
+        row: dict[str, Any] = {"episode_index": self.episodes, "tasks": [episode.task], "length": count}
         row |= {f"data/{name}": value for name, value in self._data.place().items()}
-        row |= {"dataset_from_index": self.rows, "dataset_to_index": self.rows + len(episode.rgb)}
-        row |= {f"videos/{self.camera}/{name}": value for name, value in _place(self._files).items()}
-        row[f"videos/{self.camera}/from_timestamp"] = begins / self.video.fps
-        row[f"videos/{self.camera}/to_timestamp"] = self._file.frames / self.video.fps
+        row |= {"dataset_from_index": self.rows, "dataset_to_index": self.rows + count}
+        for camera in self.cameras:
+            if camera not in self._open:
+                path = self.video_path.format(video_key=camera, **_place(self._files))
+                self._open[camera] = VideoFile(self.root / path, self.video)
+            file = self._open[camera]
+            begins = file.frames
+            file.add(episode.videos[camera])
+            row |= {f"videos/{camera}/{name}": value for name, value in _place(self._files).items()}
+            row[f"videos/{camera}/from_timestamp"] = begins / self.video.fps
+            row[f"videos/{camera}/to_timestamp"] = file.frames / self.video.fps
         for feature, values in plain_stats(stats).items():
             row |= {f"stats/{feature}/{name}": value for name, value in values.items()}
         self._data.add(table)
@@ -356,18 +359,18 @@ class LayoutV30(_Layout):
         self._meta.add(pa.Table.from_pylist([row | place for row in self._buffer]))
         self._buffer = []
 
-    def _close_video(self) -> None:
-        if self._file is not None:
-            self._file.close()
-            self._file = None
-            self._files += 1
+    def _close_videos(self) -> None:
+        for file in self._open.values():
+            file.close()
+        self._open = {}
+        self._files += 1
 
     def _finish(self) -> dict[str, Any]:
         if self._buffer:
             self._flush()
         for tables in (self._data, self._meta):
             tables.close()
-        self._close_video()
+        self._close_videos()
         write_tasks(self.root / "meta" / "tasks.parquet", list(self.tasks))
         _write_json(self.root / "meta" / "stats.json", plain_stats(self._stats))
         return {"data_files_size_in_mb": DATA_MEGABYTES, "video_files_size_in_mb": VIDEO_MEGABYTES}

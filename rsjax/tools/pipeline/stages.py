@@ -128,9 +128,9 @@ def _where_clips_come_from(run: Run) -> str:
     sim = run.config.sim
     if sim.env == "lift":
         return f"simulating {sim.episodes} Lift episodes into {run.clips}"
-    if sim.env == "rope":
-        return f"simulating {sim.episodes} episodes of {' and '.join(sim.train_tasks)} into {run.clips}"
-    return f"simulating {sim.episodes} Meta-World episodes of {len(sim.train_tasks)} tasks into {run.clips}"
+    if sim.env == "metaworld":
+        return f"simulating {sim.episodes} Meta-World episodes of {len(sim.train_tasks)} tasks into {run.clips}"
+    return f"simulating {sim.episodes} episodes of {', '.join(sim.train_tasks)} into {run.clips}"
 
 
 def collect_clips(run: Run) -> None:

@@ -12,7 +12,7 @@ from rsjax.clip import Clip
 from rsjax.config import SimConfig, to_dict
 from rsjax.config.metaworld import SIMPLE
 from rsjax.config.sim import CONTROLS
-from rsjax.tools.sim import expert, lift, metaworld, panda, rope
+from rsjax.tools.sim import expert, lift, metaworld, panda, rope, tabletop
 from rsjax.tools.sim.render import Camera, View
 from rsjax.tools.sim.scenery import SEEN, Change, Variation, draw_variation
 from rsjax.tools.sim.tracks import Snapshot, grid_pixels, object_pixels, track
@@ -140,6 +140,14 @@ ENVIRONMENTS = {
         metaworld.MetaworldSim, "metaworld/Sawyer", "metaworld", metaworld.CONTROL_HZ, metaworld.MODES
     ),
     "rope": Environment(rope.RopeSim, "robosuite/Rope/Panda", "robosuite", panda.CONTROL_HZ, rope.MODES, rope.SIMPLE),
+    "tabletop": Environment(
+        tabletop.TabletopSim,
+        "robosuite/Tabletop/Panda",
+        "robosuite",
+        panda.CONTROL_HZ,
+        tabletop.MODES,
+        tabletop.SIMPLE,
+    ),
 }
 
 
