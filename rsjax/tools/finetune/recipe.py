@@ -19,7 +19,8 @@ from rsjax.tools.pipeline.validation import held_out
 
 MARGIN = 3.0  # dB by which the tokenizer's reconstruction must be better than the first frame repeated, to be kept
 MEASURED_CLIPS = 32
-VALIDATIONS = 8  # of each training
+VALIDATIONS = 8  # of each training, at most
+LEAST_BETWEEN = 20  # steps from one to the next, since each generates videos
 EPOCHS = 18  # of the world model
 TOKENIZER_EPOCHS = 27
 LEAST_STEPS = 100
@@ -178,7 +179,7 @@ def finetuned(source: Source, store: Store, start: str, settings: Finetuning, ad
 
 def early_stop(settings: Finetuning, steps: int) -> EarlyStopConfig:
     """Returns when a training of so many steps validates and stops."""
-    return EarlyStopConfig(every=max(1, steps // VALIDATIONS), patience=settings.patience)
+    return EarlyStopConfig(every=max(LEAST_BETWEEN, steps // VALIDATIONS), patience=settings.patience)
 
 
 def slower(optimizer: Any, share: float, steps: int) -> Any:
