@@ -26,8 +26,8 @@ def load(run: "Path | str") -> "TrainedModel":
     """Loads a trained world model.
 
     Args:
-        run: ``"tiny"``, the model in the package; a directory that ``model.save`` or ``rsjax save`` wrote; or a run
-            directory of ``rsjax train``, such as ``"runs/tiny"``.
+        run: ``"tiny"`` or ``"multitask"``, the models in the package; a directory that ``model.save`` or ``rsjax save``
+            wrote; or a run directory of ``rsjax train``, such as ``"runs/tiny"``.
 
     Returns:
         A model whose ``generate``, ``plan``, ``encode`` and ``decode`` take and return numpy arrays, and whose ``save``

@@ -48,18 +48,10 @@ def locate(name: Path | str) -> Path:
     """Returns the directory of a model: the path itself or, for a name such as "tiny", the model in the package.
 
     A directory of that name in the working directory comes first.
-
-    Raises:
-        UserError: the package holds no weights of that name.
     """
     path = Path(name)
     if str(name) not in SHIPPED or path.exists():
         return path
-    if not is_saved(PRETRAINED / path):
-        raise UserError(
-            f"this installation holds no weights of {name}, and there is no directory {name} here; make them: "
-            f"rsjax train {name}, then rsjax save runs/{name} {name}"
-        )
     return PRETRAINED / path
 
 

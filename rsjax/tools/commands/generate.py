@@ -17,7 +17,7 @@ class Options:
     """Generates the frames that follow a clip's prompt, and writes truth and prediction side by side."""
 
     run: tyro.conf.Positional[Path] = tyro.MISSING
-    """A run directory, made by rsjax train; a saved model; or tiny, the model of the package."""
+    """A run directory, made by rsjax train; a saved model; or tiny or multitask, the package's models."""
     data_dir: Path = Path("data")
     """Directory of simulated data sets."""
     store: Path | None = None

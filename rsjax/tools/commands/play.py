@@ -16,7 +16,7 @@ class Options:
     """Opens a page in which a person steers the robot and the run's model generates what follows (docs/play.md)."""
 
     run: tyro.conf.Positional[Path] = tyro.MISSING
-    """A run directory, made by rsjax train; a saved model; or tiny, the model of the package."""
+    """A run directory, made by rsjax train; a saved model; or tiny or multitask, the package's models."""
     data_dir: Path = Path("data")
     """Directory of simulated data sets."""
     store: Path | None = None

@@ -17,7 +17,7 @@ class Options:
     """Serves a run's world model to programs: reset, step and generate, as openpi serves policies (docs/serve.md)."""
 
     run: tyro.conf.Positional[Path] = tyro.MISSING
-    """A run directory, made by rsjax train, or tiny, the model in the package."""
+    """A run directory, made by rsjax train, or tiny or multitask, the package's models."""
     data_dir: Path = Path("data")
     """Directory of simulated data sets."""
     store: Path | None = None

@@ -11,7 +11,7 @@ from PIL import Image
 import rsjax
 from rsjax.data.clips import load_clips
 from rsjax.errors import UserError
-from rsjax.model_directory import PRETRAINED
+from rsjax.model_directory import PRETRAINED, SHIPPED
 from rsjax.models.load_run import load_config
 from rsjax.tools.pipeline.provenance import record_start
 from rsjax.tools.pipeline.publishing import Publication, loss_of_rounding, predicted_psnr, publish
@@ -114,25 +114,12 @@ def test_an_unfinished_run_is_refused(run: Run, tmp_path: Path) -> None:
     assert "metrics.json: missing; the train command of this run makes it" in str(caught.value)
 
 
-@pytest.mark.parametrize("name", ["tiny"])
+@pytest.mark.parametrize("name", SHIPPED)
 def test_the_package_holds_a_small_model_that_beats_repeating_the_first_frame(name: str) -> None:
     folder = PRETRAINED / name
-    if not folder.exists():
-        pytest.skip("rsjax save has not made it yet")
     assert (folder / "model.safetensors").stat().st_size <= 10e6
     assert sum(path.stat().st_size for path in (folder / "clips").iterdir()) <= 3e6
     assert load_config(folder).name == name
     clips = load_clips(Run(load_config(folder), folder, Path()).open_clips(), 2)
     still = 10 * np.log10(255**2 / ((clips.rgb[:, 1:] - clips.rgb[:, :1].astype(float)) ** 2).mean((2, 3, 4)))
     assert predicted_psnr(rsjax.load(name), clips).mean() > still.mean() + 2
-
-
-def test_a_model_that_is_not_in_the_package_is_made_by_a_command_that_the_error_names(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    if (PRETRAINED / "multitask").exists():
-        pytest.skip("it is there")
-    with pytest.raises(UserError) as caught:
-        rsjax.load("multitask")
-    assert "rsjax train multitask, then rsjax save runs/multitask multitask" in str(caught.value)
