@@ -1,8 +1,9 @@
 """Adds pages to the documentation's site that are made, and leads links to files of the repository to pages.
 
-A hook of MkDocs (``mkdocs.yml``): ``make docs`` builds the site. Three kinds of pages are made: the README, the
-notebooks and the files for contributors, as they are; each source file or folder that a page links to; and the
-reference, from docstrings: the Python API, the fields of every configuration, and each command's options.
+A hook of MkDocs (``mkdocs.yml``): ``make docs`` builds the site. Three kinds of pages are made: the README, the lab
+notebooks, the Jupyter notebooks of examples/ and the files for contributors, as they are; each source file or folder
+that a page links to; and the reference, from docstrings: the Python API, the fields of every configuration, and each
+command's options.
 """
 
 import contextlib
@@ -10,6 +11,7 @@ import dataclasses
 import importlib
 import inspect
 import io
+import json
 import os
 import posixpath
 import re
@@ -65,7 +67,8 @@ def on_config(config: Any) -> Any:
         api = [{title: f"reference/api/{_name(title)}.md"} for title in API]
         reference.extend([{"Commands": commands}, {"Configuration": fields}, {"Python API": api}])
         notebooks = [f"notebooks/{path.name}" for path in sorted((ROOT / "notebooks").glob("*.md"))]
-        sections["Lab results"].append({"Notebooks": notebooks})
+        sections["Lab results"].append({"Lab notebooks": notebooks})
+        sections["Start here"].append({"Notebooks": [example_page(name) for name in examples()]})
         sections["Explanation"] += [{"Changes": AS_THEY_ARE["CHANGELOG.md"]}, {"Security": AS_THEY_ARE["SECURITY.md"]}]
     return config
 
@@ -83,6 +86,8 @@ def on_files(files: Any, config: Any) -> Any:
         _register(name, page)
     for path in sorted((ROOT / "notebooks").glob("*.md")):
         _register(f"notebooks/{path.name}", f"notebooks/{path.name}")
+    for name in examples():
+        _register(name, example_page(name))
     waiting += [name for name in _sites if name not in waiting]
     done: set[str] = set()
     while waiting:
@@ -165,8 +170,31 @@ def repository_page(name: str) -> str:
         return f"---\nsearch:\n  exclude: true\n---\n# {name}/\n\n{text}\n" + "\n".join(files) + "\n"
     if path.suffix == ".md":
         return path.read_text()
+    if path.suffix == ".ipynb":
+        return notebook_text(path)
     code = path.read_text()
     return f"---\nsearch:\n  exclude: true\n---\n# {name}\n\n`````{CODE.get(path.suffix, 'text')}\n{code}`````\n"
+
+
+def examples() -> list[str]:
+    """Returns the paths of the Jupyter notebooks in the repository."""
+    return [f"examples/{path.name}" for path in sorted((ROOT / "examples").glob("*.ipynb"))]
+
+
+def example_page(name: str) -> str:
+    """Returns the path of a Jupyter notebook's page in the site."""
+    return f"{name.removesuffix('.ipynb')}.md"
+
+
+def notebook_text(path: Path) -> str:
+    """Returns a Jupyter notebook as Markdown: its text as it is, its code in blocks."""
+    parts = []
+    for cell in json.loads(path.read_text())["cells"]:
+        text = "".join(cell["source"])
+        if cell["cell_type"] == "code":
+            text = f"```python\n{text}\n```"
+        parts.append(text)
+    return "\n\n".join(parts) + "\n"
 
 
 def command_page(name: str) -> str:

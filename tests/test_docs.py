@@ -28,7 +28,7 @@ def anchors(page: Path) -> set[str]:
 
 def folder_readmes() -> list[Path]:
     """Returns the pages of all folders but the cards of models."""
-    folders = ("rsjax", "experiments", "benchmarks", "notebooks", "scripts")
+    folders = ("rsjax", "examples", "experiments", "benchmarks", "notebooks", "scripts")
     paths = [path for folder in folders for path in sorted((ROOT / folder).rglob("README.md"))]
     return [path for path in paths if path.parents[1].name != "pretrained"]
 
