@@ -69,7 +69,10 @@ def main() -> None:
     vary = options.vary
     if vary == "auto":
         vary = "everything" if seconds >= VARY_EVERYTHING else "model"
-    sizes = scale(preset, parse_duration(options.size or options.budget))
+    size = seconds
+    if options.size:
+        size = parse_duration(options.size, "--size")
+    sizes = scale(preset, size)
     plan = make_plan(wanted, replace(sizes, seconds=seconds), options.data_dir, options.seeds, vary)
     command = shlex.join([*PROG.split(), *sys.argv[1:]])
     run.print_plan(plan, options.dir, options.data_dir)

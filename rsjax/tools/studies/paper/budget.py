@@ -67,8 +67,11 @@ VARY_EVERYTHING = 12 * HOUR  # from this budget on, where clips and tokenizers o
 MOST_SECONDS = 366 * 86400
 
 
-def parse_duration(text: str) -> float:
+def parse_duration(text: str, option: str = "--budget") -> float:
     """Returns the seconds of a duration such as ``30min``, ``3h`` or ``1h30min``.
+
+    Args:
+        option: where it was given, for the error.
 
     Raises:
         ConfigError: the text is no duration above 0.
@@ -77,8 +80,8 @@ def parse_duration(text: str) -> float:
     found = list(_TERM.finditer(text))
     seconds = sum(float(term[1]) * _UNITS[term[2]] for term in found)
     whole = "".join(term[0] for term in found) == text
-    require(whole and seconds > 0, f"--budget {text:.80}: not a duration; write 30min, 3h, 12h or 1h30min")
-    require(seconds <= MOST_SECONDS, f"--budget {text:.80}: longer than {MOST_SECONDS // 86400} days")
+    require(whole and seconds > 0, f"{option} {text:.80}: not a duration; write 30min, 3h, 12h or 1h30min")
+    require(seconds <= MOST_SECONDS, f"{option} {text:.80}: longer than {MOST_SECONDS // 86400} days")
     return seconds
 
 
