@@ -31,6 +31,7 @@ def test_no_program_has_become_more_expensive() -> None:
     ("line", "devices"),
     [
         ("debug --target h100x2 --train.batch-size 4", 2),
+        ("roboscape_agibot --target a100x2 --model.blocks 1 --train.batch-size 4", 2),
         # Collectives are fused with kernels, so that jax cannot read the program back.
         ("debug --target v5p-8 --train.batch-size 8 --runtime.sharding mesh --runtime.fsdp 4", 4),
     ],
