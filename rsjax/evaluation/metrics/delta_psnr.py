@@ -61,7 +61,7 @@ def action_range(actions: Float[np.ndarray, "N T A"]) -> tuple[Float[np.ndarray,
     Row 0 of each clip is left out, since no action led into the first frame.
     """
     low, high = np.percentile(actions[:, 1:].reshape(-1, actions.shape[-1]), [1, 99], axis=0)
-    return low, high
+    return low + 0.0, high + 0.0  # no -0.0, which numpy refuses as the end of a range that begins at 0.0
 
 
 def uniform_actions(
