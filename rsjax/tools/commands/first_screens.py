@@ -118,6 +118,11 @@ FIRST_SCREENS = {
         "docs/results and README.md of the checkout",
         ("add", "study", "run", "name", "check"),
     ),
+    "detect": FirstScreen(
+        "rsjax detect video.mp4 data/pusht",
+        "the terminal: a line for each video or clip; --train writes a detector to --out",
+        ("split", "detector", "train", "out", "measure"),
+    ),
     "record": FirstScreen(
         "rsjax record runs/tiny --policies runs/tiny/policy_learning/real-200-seed0",
         "RUN/recorded (--out): a store of episodes",

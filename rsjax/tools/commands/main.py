@@ -13,7 +13,7 @@ from rsjax.runtime import answer_while_importing
 COMMANDS = {  # each is a module of this package with a function main
     "Start here": ("demo", "play", "generate", "finetune", "train"),
     "Data": ("doctor", "ingest", "inspect", "store", "export"),
-    "Evaluate": ("evaluate", "compare", "ablation", "paper", "results"),
+    "Evaluate": ("evaluate", "compare", "ablation", "paper", "results", "detect"),
     "Policies": ("record", "adapt", "judge", "synthesize", "policy_learning", "policy_evaluation", "improve", "plan"),
     "Models": ("serve", "save", "hub", "describe", "compile", "bench", "convert", "replay"),
 }

@@ -2,8 +2,9 @@
 
 A page has a table between two lines, ``<!-- table NAME PART -->`` and ``<!-- end -->``: that part of the file
 ``NAME.json``. The file's ``kind`` says how it is read: "measured" (:mod:`rsjax.tools.studies.paper.result_files`),
-"run" (:mod:`rsjax.tools.studies.run_results`) or "transcribed" (:mod:`rsjax.tools.studies.transcribed`). A picture
-``docs/results/NAME.png`` that a page shows is drawn from ``NAME.json`` if that was measured.
+"run" (:mod:`rsjax.tools.studies.run_results`), "detector" (:mod:`rsjax.tools.detector.training`) or "transcribed"
+(:mod:`rsjax.tools.studies.transcribed`). A picture ``docs/results/NAME.png`` that a page shows is drawn from
+``NAME.json`` if that was measured.
 """
 
 import re
@@ -15,6 +16,7 @@ from PIL import Image
 from rsjax.errors import UserError, did_you_mean
 from rsjax.files import read_json, write_file
 from rsjax.models.load_run import load_config
+from rsjax.tools.detector import training
 from rsjax.tools.pipeline.run import Run
 from rsjax.tools.studies import run_results
 from rsjax.tools.studies.paper.claim_tables import claim_content, claim_figure, claim_tables
@@ -54,6 +56,9 @@ def part_of(root: Path, name: str, part: str) -> str:
     elif content["kind"] == run_results.KIND:
         tables = run_results.run_tables(content)
         below = f"\n\n{run_results.about_runs(content)}"
+    elif content["kind"] == training.KIND:
+        tables = training.tables(content["rows"])
+        below = f"\n\n{about_result(path)}."
     else:
         tables = {key: transcribed_table(table) for key, table in content["tables"].items()}
     if part not in tables:
