@@ -90,8 +90,9 @@ def test_a_saved_detector_is_the_same_and_damage_is_noticed(detector: Detector, 
     assert load_detector(tmp_path)(features) == pytest.approx(detector(features), abs=1e-5)
     path = tmp_path / "detector.safetensors"
     path.write_bytes(path.read_bytes()[:-1] + b"\x01")
-    with pytest.raises(UserError, match="SHA-256"):
+    with pytest.raises(UserError) as damaged:
         load_detector(tmp_path)
+    assert "SHA-256" in str(damaged.value)
     with pytest.raises(UserError):
         load_detector(tmp_path / "nowhere")
 

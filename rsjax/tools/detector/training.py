@@ -41,7 +41,7 @@ def h264(quality: int) -> Treatment:
                 container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24")))
             container.mux(stream.encode())
         buffer.seek(0)
-        with av.open(buffer) as container:
+        with av.open(buffer, "r") as container:
             return np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)])
 
     return treat
@@ -53,7 +53,7 @@ def webp(quality: int) -> Treatment:
     def treat(frames: UInt8[np.ndarray, "T H W 3"]) -> UInt8[np.ndarray, "T H W 3"]:
         setting = [cv2.IMWRITE_WEBP_QUALITY, quality]
         files = [cv2.imencode(".webp", frame[..., ::-1], setting)[1] for frame in frames]
-        return np.stack([cv2.imdecode(file, cv2.IMREAD_COLOR)[..., ::-1] for file in files])
+        return np.stack([np.asarray(cv2.imdecode(file, cv2.IMREAD_COLOR))[..., ::-1] for file in files])
 
     return treat
 

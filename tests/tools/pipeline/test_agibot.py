@@ -7,6 +7,7 @@ import json
 import sys
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import cv2
 import h5py
@@ -133,14 +134,12 @@ def write_episode(root: Path, task: str, episode: int) -> None:
             file[name] = array
 
 
-def test_twenty_steps_on_agibots_layout(
-    recordings: Path, tmp_path: Path, command: Commands, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_twenty_steps_on_agibots_layout(recordings: Path, tmp_path: Path, command: Commands) -> None:
     store = tmp_path / "store"
     line = ["agibot", recordings, "--out", store, "--recipe", "paper", "--windows.rate", 2, "--windows.frames", FRAMES]
     line += ["--difficulty", "agibot", "--option", 'cameras=["head"]', "--test-share", 0.2, "--workers", 0]
-    monkeypatch.setattr(sys, "argv", ["ingest", *map(str, line)])
-    ingest.main()
+    with patch.object(sys, "argv", ["ingest", *map(str, line)]):
+        ingest.main()
     clips = open_store(store)
     counts = clips.labels("train").counts()["difficulty"]
     assert counts == {"simple": 4, "difficult": 4}
