@@ -70,6 +70,25 @@ def tiny() -> Config:
     return replace(small, train=replace(small.train, steps=3400))
 
 
+def tiny_policies() -> Config:
+    """Trains the package's ``tiny`` further, on clips in which position decides: for policies (docs/contacts.md)."""
+    small = tiny()
+    recipe = ("expert=0.25", "grasps=0.5", "driving=0.15", "novices=0.05", "slips=0.05")
+    model = small.model
+    assert isinstance(model, RoboScapeConfig)
+    return replace(
+        small,
+        name="tiny_policies",
+        sim=replace(small.sim, episodes=1600, recipe=recipe),
+        tokenizer_train=replace(small.tokenizer_train, start_from="tiny", steps=0),
+        # It has learned to read its own frames.
+        model=replace(model, departures=replace(model.departures, self_conditioning_after=0)),
+        train=replace(
+            small.train, start_from="tiny", steps=2500, optimizer=replace(small.train.optimizer, learning_rate=3e-3)
+        ),
+    )
+
+
 def roboscape_tiny() -> Config:
     """Returns the paper's two branches and all its losses, with departures, at the size of ``tiny``."""
     return Config(
@@ -290,6 +309,7 @@ def collect(*configs: Config) -> dict[str, Config]:
 PRESETS = collect(
     debug(),
     tiny(),
+    tiny_policies(),
     multitask(),
     roboscape_s(),
     roboscape_m(),

@@ -10,6 +10,7 @@ from rsjax.models.base import create_model
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.tools.describe import by_part, count
 
+SMALL = ("debug", "tiny", "tiny_policies", "multitask")
 WORLD_MODELS = {  # (RGB branch with what it shares, all)
     "genie_35m": (35_218_688, 35_218_688),  # published
     "genie_138m": (137_545_216, 137_545_216),  # published
@@ -60,7 +61,7 @@ def test_the_presets_of_the_paper_have_its_depth_branch_and_those_of_physics_a_h
 
 
 def test_full_size_presets_of_every_family_are_scored_alike() -> None:
-    full_size = [each for name, each in presets.PRESETS.items() if not name.endswith(("debug", "tiny", "multitask"))]
+    full_size = [each for name, each in presets.PRESETS.items() if not name.endswith(SMALL)]
     assert {each.model.family for each in full_size} == {"roboscape", "genie", "ivideogpt", "irasim", "cogvideox"}
     assert {(each.eval.clips, each.eval.repetitions) for each in full_size} == {(1200, 5)}
 

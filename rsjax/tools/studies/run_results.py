@@ -33,6 +33,13 @@ COLUMNS = (
     "gripper_error_widths",
 )
 LIFTED = "lifted_accuracy"
+PROBES = (
+    "contact_false_success",
+    "contact_false_failure",
+    "contact_brier",
+    "drive_gripper_error_widths",
+    "drive_psnr",
+)
 OF_A_SEED = ("seed", "store", "key", "start_from")
 ROWS = {
     "": "prediction",
@@ -48,7 +55,7 @@ def write_runs(path: Path, runs: Sequence[Run]) -> None:
     Raises:
         UserError: a run is not finished, or two differ in more.
     """
-    names = [f"{name}{suffix}" for name in (*COLUMNS, LIFTED) for suffix in ROWS]
+    names = [f"{name}{suffix}" for name in (*COLUMNS, LIFTED, *PROBES) for suffix in ROWS]
     scores = []
     for run in runs:
         found = read_metrics(run)
@@ -74,13 +81,20 @@ def _without_seeds(value: Any) -> Any:
 
 
 def run_tables(content: Mapping[str, Any]) -> dict[str, Table]:
-    """Returns the table "scores" of a file: the prediction and what it is compared with, as means over the runs.
+    """Returns the tables of a file: "scores" and, where the model was probed, "contacts".
 
-    The share of clips in which "lifted" is read correctly has Wilson's interval over the clips of all runs.
+    Their rows are the prediction and what it is compared with, as means over the runs. The share of clips in which
+    "lifted" is read correctly has Wilson's interval over the clips of all runs.
     """
+    measured = {name for run in content["runs"] for name in run["metrics"]}
+    tables = {"scores": _table(content, [name for name in COLUMNS if name in measured], LIFTED in measured)}
+    if probes := [name for name in PROBES if name in measured]:
+        tables["contacts"] = _table(content, probes, lifted=False)
+    return tables
+
+
+def _table(content: Mapping[str, Any], shown: Sequence[str], lifted: bool) -> Table:
     known = metrics()
-    shown = [name for name in COLUMNS if any(name in run["metrics"] for run in content["runs"])]
-    lifted = any(LIFTED in run["metrics"] for run in content["runs"])
     head = ["", *(known[name].heading for name in shown)]
     if lifted:
         head.append('"lifted" read correctly, 95 % interval')
@@ -91,7 +105,7 @@ def run_tables(content: Mapping[str, Any]) -> dict[str, Table]:
             cells.append(_share(content["runs"], f"{LIFTED}{suffix}"))
         if any(cells[1:]):
             rows.append(cells)
-    return {"scores": Table(head, rows)}
+    return Table(head, rows)
 
 
 def about_runs(content: Mapping[str, Any]) -> str:
