@@ -38,6 +38,7 @@ LINES = {
     "adapt": f"adapt {RUN} --policy {POLICY} --out NEW",
     "judge": f"judge {RUN}",
     "finetune": "finetune MATERIAL/run --data MATERIAL/store --out NEW",
+    "detect": "detect MATERIAL/store",
     "synthesize": f"synthesize {RUN} --only all --out NEW",
     "policy_learning": f"policy_learning {RUN} --size toy --synthetic MATERIAL/synthetic/clips --out NEW",
     "policy_evaluation": f"policy_evaluation {RUN} --size toy --policies {POLICY} {POLICY}/at-2 --out NEW",
