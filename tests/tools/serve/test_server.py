@@ -200,7 +200,7 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"endpoint": "exec"}, "endpoint is 'exec'"),
     ({"endpoint": ["step"]}, "endpoint is ['step']"),
     ({"endpoint": "step", "actions": [0]}, "unknown field 'actions'; did you mean 'action'?"),
-    ({"endpoint": "step"}, "actions have shape (); expected (28,)"),
+    ({"endpoint": "step"}, "expected floats of shape (28,)"),
     ({"endpoint": "step", "action": np.zeros(7)}, "actions have shape (7,); expected (28,)"),
     ({"endpoint": "step", "action": np.full(28, np.inf)}, "actions[0] is inf"),
     ({"endpoint": "step", "action": {"a": 1}}, "expected floats of shape (28,)"),
