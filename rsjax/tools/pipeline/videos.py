@@ -131,7 +131,7 @@ def write_demo(model: Path, data_dir: Path, out: Path, number: int | None = None
     figure = ClipFigure(title, clip["rgb"], videos.rgb[0], other_actions=videos.rgb[1], **depth)
     video = out / f"clip-{number}.mp4"
     strip = video.with_suffix(".png")
-    write_mp4(video, animation(figure), DEMO_FPS)
+    write_mp4(video, animation(figure), DEMO_FPS, comment=GENERATED_MARK)
     picture = io.BytesIO()
     Image.fromarray(filmstrip(figure)).save(picture, "PNG")
     write_file(strip, picture.getvalue())

@@ -9,6 +9,7 @@ import pytest
 from PIL import Image
 
 import rsjax
+from rsjax.clip import GENERATED_MARK
 from rsjax.data.clips import load_clips
 from rsjax.errors import UserError
 from rsjax.model_directory import PRETRAINED, SHIPPED
@@ -92,6 +93,7 @@ def test_videos_the_demo_and_the_playground_work_from_the_directory_alone(publis
     assert written.name == "test_001.mp4"
     video, strip = write_demo(published, Path("nowhere"), tmp_path / "demo", 1)
     with av.open(str(video)) as container:
+        assert container.metadata["comment"] == GENERATED_MARK
         assert len(list(container.decode(video=0))) == toy.config().sim.frames
     with Image.open(strip) as picture:
         assert min(picture.size) > 100
