@@ -20,6 +20,7 @@ from jaxtyping import Float, UInt8
 
 from rsjax.errors import UserError, first_line
 from rsjax.files import read_json, regular, write_file, write_json
+from rsjax.tools.logistic_regression import LogisticRegression
 
 SIDE = 64  # pixels; other frames are scaled
 RINGS = 24
@@ -35,30 +36,24 @@ YCBCR = np.array([[0.299, 0.587, 0.114], [-0.1687, -0.3313, 0.5], [0.5, -0.4187,
 
 @dataclass(frozen=True)
 class Detector:
-    """A linear rule: a video is generated if its standardised features, weighted, add up to more than ``-bias``.
+    """A rule on the features of videos, in which generated ones are positive, and half of all.
 
     Attributes:
-        mean, scale: of the features of the training videos.
-        weights: of the standardised features.
-        bias: the log odds of a video with mean features.
-        about: what it was trained on and how well it does, JSON-ready.
+        about: what it was trained on, JSON-ready.
     """
 
-    mean: Float[np.ndarray, " F"]
-    scale: Float[np.ndarray, " F"]
-    weights: Float[np.ndarray, " F"]
-    bias: float
+    rule: LogisticRegression
     about: dict[str, Any] = field(default_factory=dict)
 
     def __call__(self, features: Float[np.ndarray, "N F"]) -> Float[np.ndarray, " N"]:
-        """Returns the probability that each video is generated, where half of all videos are."""
-        logits = ((features - self.mean) / self.scale) @ self.weights + self.bias
-        return 1 / (1 + np.exp(-np.clip(logits, -50, 50)))
+        """Returns the probability that each video is generated."""
+        return self.rule(features)
 
     def save(self, folder: Path) -> None:
         """Writes what :func:`load_detector` reads: the tensors, and a record with their SHA-256."""
-        parts = {"mean": self.mean, "scale": self.scale, "weights": self.weights, "bias": np.array([self.bias])}
-        tensors = safetensors.numpy.save({name: np.asarray(x, np.float32) for name, x in parts.items()})
+        tensors = safetensors.numpy.save(
+            {name: np.atleast_1d(x).astype(np.float32) for name, x in vars(self.rule).items()}
+        )
         write_file(folder / TENSORS, tensors)
         write_json(folder / RECORD, {"sha256": hashlib.sha256(tensors).hexdigest(), "about": self.about})
 
@@ -84,7 +79,8 @@ def load_detector(folder: Path = SHIPPED) -> Detector:
     if {name: x.shape for name, x in tensors.items()} != shapes:
         raise UserError(f"{path}: is of another version; {AGAIN}")
     parts = {name: x.astype(float) for name, x in tensors.items()}
-    return Detector(parts["mean"], parts["scale"], parts["weights"], float(parts["bias"][0]), record.get("about", {}))
+    rule = LogisticRegression(parts["mean"], parts["scale"], parts["weights"], float(parts["bias"][0]))
+    return Detector(rule, record.get("about", {}))
 
 
 def video_features(frames: UInt8[np.ndarray, "T H W 3"]) -> Float[np.ndarray, " F"]:
@@ -118,23 +114,3 @@ def _window_and_rings() -> tuple[Float[np.ndarray, "S S"], Float[np.ndarray, "K 
     ring = np.minimum(radius / radius.max() * RINGS, RINGS - 1).astype(int).ravel()
     member = (ring[:, None] == np.arange(RINGS)).astype(np.float32)
     return across[:, None] * across[None], member / member.sum(0)
-
-
-def fit(features: Float[np.ndarray, "N F"], generated: Float[np.ndarray, " N"], decay: float = 1.0) -> Detector:
-    """Fits the rule by Newton's method; the result depends on the arguments alone.
-
-    Args:
-        generated: 1 for a generated video, 0 for a real one.
-        decay: weight of half the squared weights, beside the sum of all videos' cross-entropies.
-    """
-    mean = features.mean(0)
-    scale = features.std(0) + 1e-6
-    inputs = np.concatenate([(features - mean) / scale, np.ones((len(features), 1))], axis=1)
-    pull = np.append(np.full(features.shape[1], decay), 1e-6)  # the bias is free
-    solution = np.zeros(len(pull))
-    for _ in range(25):
-        guess = 1 / (1 + np.exp(-np.clip(inputs @ solution, -50, 50)))
-        gradient = inputs.T @ (guess - generated) + pull * solution
-        curvature = (inputs.T * (guess * (1 - guess))) @ inputs + np.diag(pull)
-        solution = solution - np.linalg.solve(curvature, gradient)
-    return Detector(mean, scale, solution[:-1], float(solution[-1]))

@@ -14,46 +14,42 @@ import av
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
+from PIL import Image
 
 from rsjax.config import Config, require
 from rsjax.evaluation.results import read_frames
 from rsjax.files import write_file
 from rsjax.models.load_run import load_config
 from rsjax.progress import Progress
-from rsjax.tools.detector.spectra import Detector, fit, video_features
+from rsjax.tools.detector.spectra import Detector, video_features
+from rsjax.tools.logistic_regression import fit
 from rsjax.tools.pipeline.run import Run
 from rsjax.tools.studies.paper.result_files import as_text, provenance
+from rsjax.tools.studies.report.video import mp4, webp
 from rsjax.tools.studies.tables import Table, as_markdown
 
 Treatment = Callable[[UInt8[np.ndarray, "T H W 3"]], UInt8[np.ndarray, "T H W 3"]]
 
 
-def h264(quality: int) -> Treatment:
-    """Returns the encoding as H.264 (yuv420p) with a constant rate factor, and decoding."""
+KIND = "detector"  # of a file of results
+HEAD = ("runs", "AUC ↑", "lowest run's", "generated videos caught ↑", "real ones called generated ↓")
+
+
+def h264(crf: int) -> Treatment:
+    """Returns the encoding as H.264 with a constant rate factor, and decoding."""
 
     def treat(frames: UInt8[np.ndarray, "T H W 3"]) -> UInt8[np.ndarray, "T H W 3"]:
-        buffer = io.BytesIO()
-        with av.open(buffer, "w", format="mp4") as container:
-            stream = container.add_stream("libx264", rate=5, options={"crf": str(quality)})
-            stream.height, stream.width = frames.shape[1:3]
-            stream.pix_fmt = "yuv420p"
-            for frame in frames:
-                container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24")))
-            container.mux(stream.encode())
-        buffer.seek(0)
-        with av.open(buffer, "r") as container:
+        with av.open(io.BytesIO(mp4(frames, 5.0, crf)), "r") as container:
             return np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)])
 
     return treat
 
 
-def webp(quality: int) -> Treatment:
+def as_webp(quality: int) -> Treatment:
     """Returns the encoding of each frame as lossy WebP, and decoding."""
 
     def treat(frames: UInt8[np.ndarray, "T H W 3"]) -> UInt8[np.ndarray, "T H W 3"]:
-        setting = [cv2.IMWRITE_WEBP_QUALITY, quality]
-        files = [cv2.imencode(".webp", frame[..., ::-1], setting)[1] for frame in frames]
-        return np.stack([np.asarray(cv2.imdecode(file, cv2.IMREAD_COLOR))[..., ::-1] for file in files])
+        return np.stack([np.asarray(Image.open(io.BytesIO(webp(frame, quality)))) for frame in frames])
 
     return treat
 
@@ -75,9 +71,6 @@ def noisy(frames: UInt8[np.ndarray, "T H W 3"]) -> UInt8[np.ndarray, "T H W 3"]:
     return np.clip(frames + noise, 0, 255).astype(np.uint8)
 
 
-KIND = "detector"  # of a file of results
-
-
 def halved(frames: UInt8[np.ndarray, "T H W 3"]) -> UInt8[np.ndarray, "T H W 3"]:
     """Returns frames of half the side, each pixel the mean of four."""
     size = (frames.shape[2] // 2, frames.shape[1] // 2)
@@ -96,8 +89,8 @@ TREATMENTS: dict[str, Treatment] = {
     "MP4, CRF 18": h264(18),
     "MP4, CRF 28": h264(28),
     "MP4, CRF 35": h264(35),
-    "WebP, quality 80": webp(80),
-    "WebP, quality 30": webp(30),
+    "WebP, quality 80": as_webp(80),
+    "WebP, quality 30": as_webp(30),
     "1.5 times as large": enlarged,
     "softened": softened,
     "noise": noisy,
@@ -159,8 +152,8 @@ def train(footage: Sequence[Footage]) -> Detector:
     """Trains a detector on runs' real and generated videos, as they are and re-encoded."""
     real = [each.real[name] for each in footage for name in LEARNED]
     generated = [each.generated[name] for each in footage for name in LEARNED]
-    labels = np.concatenate([np.zeros(sum(map(len, real))), np.ones(sum(map(len, generated)))])
-    return fit(np.concatenate(real + generated), labels)
+    labels = np.repeat([False, True], [sum(map(len, real)), sum(map(len, generated))])
+    return Detector(fit(np.concatenate(real + generated), labels))
 
 
 def measure(footage: Sequence[Footage]) -> list[dict[str, Any]]:
@@ -232,9 +225,6 @@ def tables(rows: Sequence[Mapping[str, Any]]) -> dict[str, Table]:
         "treatments": Table(["frames", *HEAD], treatments),
         "families": Table(["tested on, trained", *HEAD], families),
     }
-
-
-HEAD = ("runs", "AUC ↑", "lowest run's", "generated videos caught ↑", "real ones called generated ↓")
 
 
 def summary(name: str, rows: Sequence[Mapping[str, Any]]) -> list[str]:

@@ -2,9 +2,9 @@
 
 A page has a table between two lines, ``<!-- table NAME PART -->`` and ``<!-- end -->``: that part of the file
 ``NAME.json``. The file's ``kind`` says how it is read: "measured" (:mod:`rsjax.tools.studies.paper.result_files`),
-"run" (:mod:`rsjax.tools.studies.run_results`), "detector" (:mod:`rsjax.tools.detector.training`) or "transcribed"
-(:mod:`rsjax.tools.studies.transcribed`). A picture ``docs/results/NAME.png`` that a page shows is drawn from
-``NAME.json`` if that was measured.
+"run" (:mod:`rsjax.tools.studies.run_results`), "detector" (:mod:`rsjax.tools.detector.training`), "softness"
+(:mod:`rsjax.tools.studies.softness`) or "transcribed" (:mod:`rsjax.tools.studies.transcribed`). A picture
+``docs/results/NAME.png`` that a page shows is drawn from ``NAME.json`` if that was measured.
 """
 
 import re
@@ -18,7 +18,7 @@ from rsjax.files import read_json, write_file
 from rsjax.models.load_run import load_config
 from rsjax.tools.detector import training
 from rsjax.tools.pipeline.run import Run
-from rsjax.tools.studies import run_results
+from rsjax.tools.studies import run_results, softness
 from rsjax.tools.studies.paper.claim_tables import claim_content, claim_figure, claim_tables
 from rsjax.tools.studies.paper.report import RESULTS
 from rsjax.tools.studies.paper.result_files import KIND, about_result, content_key, read_result
@@ -59,6 +59,9 @@ def part_of(root: Path, name: str, part: str) -> str:
     elif content["kind"] == training.KIND:
         tables = training.tables(content["rows"])
         below = f"\n\n{about_result(path)}."
+    elif content["kind"] == softness.KIND:
+        tables = softness.tables(content)
+        below = f"\n\n{softness.summary(content)}"
     else:
         tables = {key: transcribed_table(table) for key, table in content["tables"].items()}
     if part not in tables:

@@ -10,7 +10,7 @@ Axes: N clips, T frames, K features, S×S pixels.
 """
 
 import sys
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from typing import Any
 import jax
 import numpy as np
 import tyro
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 import rsjax
 from rsjax.config import SimConfig, require
@@ -32,9 +32,12 @@ from rsjax.models.trained import TrainedModel
 from rsjax.progress import Progress
 from rsjax.runtime import tune_process
 from rsjax.tools.commands.cli import main_errors, parse_options
+from rsjax.tools.logistic_regression import fit
 from rsjax.tools.sim.collect import collect, collection_key
+from rsjax.tools.studies.tables import Table, as_markdown
 
 PROG = "python -m rsjax.tools.studies.softness"
+KIND = "softness"  # of a file of results
 SEED = 71_000  # of the episodes, which no training uses
 FOLDS = 10
 INNER = 5  # folds within a training fold, which choose the penalty
@@ -127,42 +130,26 @@ def predicted(
     for number in range(folds):
         rest = np.flatnonzero(fold != number)
         inner = np.arange(len(rest)) % INNER
-        hits = []
+        right = []
         for penalty in PENALTIES:
-            right = 0
+            asked = np.zeros(len(rest), bool)
             for part in range(INNER):
-                fit = rest[inner != part]
-                held = rest[inner == part]
-                right += int((fitted(features[fit], soft[fit], penalty)(features[held]) == soft[held]).sum())
-            hits.append(right)
-        best = PENALTIES[int(np.argmax(hits))]
-        out[fold == number] = fitted(features[rest], soft[rest], best)(features[fold == number])
+                asked[inner == part] = answers(features, soft, rest[inner != part], rest[inner == part], penalty)
+            right.append((asked == soft[rest]).sum())
+        best = PENALTIES[int(np.argmax(right))]
+        out[fold == number] = answers(features, soft, rest, np.flatnonzero(fold == number), best)
     return out
 
 
-def fitted(
-    features: Float[np.ndarray, "N K"], soft: Bool[np.ndarray, " N"], penalty: float
-) -> Callable[[Float[np.ndarray, "M K"]], Bool[np.ndarray, " M"]]:
-    """Fits a logistic regression to standardised features, and returns its prediction.
-
-    It minimises mean log(1 + exp(-y·(x·w + b))) + penalty/2·|w|², y = ±1.
-    """
-    from scipy.optimize import minimize
-    from scipy.special import expit
-
-    shift = features.mean(0)
-    scale = np.maximum(features.std(0), 1e-6)
-    x = (features - shift) / scale
-    y = np.where(soft, 1.0, -1.0)
-
-    def loss(weights: Float[np.ndarray, " K+1"]) -> tuple[float, Float[np.ndarray, " K+1"]]:
-        margin = y * (x @ weights[:-1] + weights[-1])
-        slope = -y * expit(-margin) / len(y)
-        value = np.logaddexp(0, -margin).mean() + penalty / 2 * weights[:-1] @ weights[:-1]
-        return float(value), np.append(x.T @ slope + penalty * weights[:-1], slope.sum())
-
-    weights = minimize(loss, np.zeros(x.shape[1] + 1), jac=True, method="L-BFGS-B").x
-    return lambda rows: (rows - shift) / scale @ weights[:-1] + weights[-1] > 0
+def answers(
+    features: Float[np.ndarray, "N K"],
+    soft: Bool[np.ndarray, " N"],
+    learned: Int[np.ndarray, " L"],
+    asked: Int[np.ndarray, " M"],
+    penalty: float,
+) -> Bool[np.ndarray, " M"]:
+    """Returns what a probe that has learned from some clips says of others; the penalty is beside the mean loss."""
+    return fit(features[learned], soft[learned], penalty * len(learned))(features[asked]) > 0.5
 
 
 def study(trained: TrainedModel, clips: Clips) -> dict[str, Any]:
@@ -187,19 +174,22 @@ def study(trained: TrainedModel, clips: Clips) -> dict[str, Any]:
     }
 
 
-def table(numbers: dict[str, Any]) -> str:
-    """Returns the numbers as a Markdown table."""
-    lines = ["| features | told right, 95 % interval | where the object is lifted |", "|---|---|---|"]
+def tables(numbers: Mapping[str, Any]) -> dict[str, Table]:
+    """Returns the table "scores"."""
+    rows = []
     for name, score in numbers["scores"].items():
         share = f"{score['accuracy']:.1%} ({score['low']:.1%} … {score['high']:.1%})"
-        lines.append(f"| {name} | {share} | {score['lifted']:.1%} |")
+        rows.append([name, share, f"{score['lifted']:.1%}"])
+    return {"scores": Table(["features", "told right, 95 % interval", "where the object is lifted"], rows)}
+
+
+def summary(numbers: Mapping[str, Any]) -> str:
+    """Returns what stands below the table."""
     gain = f"{100 * numbers['gain']:+.1f} ({100 * numbers['gain_low']:+.1f} … {100 * numbers['gain_high']:+.1f})"
-    lines += [
-        "",
-        f"{numbers['clips']} clips, {numbers['soft']} of them soft, the object lifted in {numbers['lifted']}. The "
-        f"model's features over {numbers['baseline']}: {gain} points.",
-    ]
-    return "\n".join(lines)
+    return (
+        f"{numbers['run']}; {numbers['clips']} clips, {numbers['soft']} of them soft, the object lifted in "
+        f"{numbers['lifted']}. The model's features over {numbers['baseline']}: {gain} points."
+    )
 
 
 def episodes_like(sim: SimConfig, episodes: int) -> SimConfig:
@@ -237,7 +227,8 @@ def main() -> None:
     sources = [store.source(split) for split in store.splits]
     records = [source[number] for source in sources for number in range(len(source))]
     numbers = study(trained, Clips.stacked(records, range(len(records))))
-    print(table(numbers))
+    numbers = {"kind": KIND, "run": options.run} | numbers
+    print(as_markdown(tables(numbers)["scores"]), summary(numbers), sep="\n\n")
     if options.json:
         write_json(options.json, numbers)
 

@@ -19,25 +19,6 @@ def test_the_probe_finds_what_is_there_and_nothing_else() -> None:
     assert 0.3 < (softness.predicted(noise, soft, folds=2) == soft).mean() < 0.7
 
 
-def test_the_fit_is_the_minimum_of_the_penalised_loss() -> None:
-    """Its prediction equals that of gradient descent on the equation."""
-    rng = np.random.default_rng(1)
-    x = rng.normal(size=(60, 2))
-    soft = x[:, 0] + rng.normal(size=60) > 0.3
-    standard = (x - x.mean(0)) / x.std(0)
-    y = np.where(soft, 1.0, -1.0)
-    weights = np.zeros(2)
-    bias = 0.0
-    for _ in range(4000):
-        slope = -y / (1 + np.exp(y * (standard @ weights + bias))) / 60
-        weights -= 0.5 * (standard.T @ slope + 0.1 * weights)
-        bias -= 0.5 * slope.sum()
-    predict = softness.fitted(x, soft, 0.1)
-    new = rng.normal(size=(200, 2))
-    wanted = (new - x.mean(0)) / x.std(0) @ weights + bias > 0
-    assert (predict(new) == wanted).mean() > 0.99
-
-
 def test_pictures_features() -> None:
     rgb = np.random.default_rng(0).integers(0, 256, (2, 3, 16, 16, 3), dtype=np.uint8)
     small = softness.shrunk(rgb)

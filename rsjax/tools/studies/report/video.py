@@ -18,7 +18,7 @@ Resample = Literal["nearest", "bicubic"]
 
 _FILTERS = {"nearest": Image.Resampling.NEAREST, "bicubic": Image.Resampling.BICUBIC}
 _HOLD = 4  # a GIF's last frame lasts this many times as long as the others
-_H264 = {"crf": "16"}  # constant rate factor: 0 is lossless, 23 the default
+_CRF = 16
 
 
 def write_mp4(
@@ -37,20 +37,29 @@ def write_mp4(
         ValueError: the frames have another shape or dtype, there are none, or the frame rate is not positive.
     """
     _check(frames, fps)
-    frames = resize(frames, upscale, "nearest")
+    write_file(path, mp4(resize(frames, upscale, "nearest"), fps, comment=comment))
+
+
+def mp4(frames: UInt8[np.ndarray, "T H W 3"], fps: float, crf: int = _CRF, comment: str = "") -> bytes:
+    """Returns frames as the content of an H.264 (yuv420p) file. Arguments as in :func:`write_mp4`.
+
+    Args:
+        crf: constant rate factor: 0 is lossless, 23 the encoder's default.
+    """
     height, width = frames.shape[1:3]
     frames = np.pad(frames, ((0, 0), (0, height % 2), (0, width % 2), (0, 0)), mode="edge")
     buffer = io.BytesIO()
     with av.open(buffer, "w", format="mp4") as container:
         if comment:
             container.metadata["comment"] = comment
-        stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1000), options=_H264)
+        rate = Fraction(fps).limit_denominator(1000)
+        stream = container.add_stream("libx264", rate=rate, options={"crf": str(crf)})
         stream.height, stream.width = frames.shape[1:3]
         stream.pix_fmt = "yuv420p"
         for frame in frames:
             container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
         container.mux(stream.encode())
-    write_file(path, buffer.getvalue())
+    return buffer.getvalue()
 
 
 def write_gif(
