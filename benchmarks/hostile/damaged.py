@@ -148,6 +148,17 @@ DOCUMENTED: dict[str, str] = {
     "weights/checksums.json deleted": "weights of earlier versions have no checksums",
     "files: run/world_model/made.json": "it says whether a training is finished; the weights have checksums",
     "files: run/world_model/log.jsonl": "a line that cannot be read counts as torn; a changed one is a speed",
+    "files: run/coverage/bank.msgpack": "without a bank that can be read, coverage is left out",
+    "files: data/lift-*/manifest.json": "a data set without a manifest that can be read is simulated again",
+    "files: data/lift-*/test-*.array_record": "a clip is read when it is asked for, and refused then",
+    "plan with the judge": "the simulator opens first, and the judge is read then",
+    "files: run/evaluation/result.json with": "a bit or a text that leaves it a result, as an editor would",
+    "files: run/metrics.json": "the card has the scores that can be read",
+    "files: saved/clips/manifest.json with a flipped bit": "a bit in a text, such as a name of an episode",
+    "files: run/run.json with a flipped bit": "a bit in a text, such as the command",
+    "files: run/tokens/units.json with a flipped bit": "a bit that leaves a number that is allowed",
+    "files: store/manifest.json with a flipped bit": "a bit in a text, such as the source",
+    "files: saved/config.json with a flipped bit": "a bit that turns a setting into another one that is allowed",
     "files: run/config.json with a": "a bit that turns a setting into another one that is allowed, as an editor would",
 }
 

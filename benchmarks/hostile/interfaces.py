@@ -68,6 +68,8 @@ DOCUMENTED = {
     "arrays: actions of 2[*][*]62": "generate takes any finite action; environments clip and count",
     "arrays: action of 2[*][*]62": "environments clip and count",
     "arrays: actions of two of 2[*][*]62": "environments clip and count",
+    "arrays: action with an axis too few": "a single environment takes (A,)",
+    "arrays: depth of nan": "a clip without depth",
     "arrays: depth of 2[*][*]62": "what is farther than the model's range counts as its far end",
 }
 

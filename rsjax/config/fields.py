@@ -81,15 +81,19 @@ def check_numbers(settings: Any, prefix: str = "", dash: bool = False) -> None:
 
     Args:
         prefix: precedes the fields' names in the error.
-        dash: whether to write the names as flags of a command line.
+        dash: whether they are options of a command, named as its flags. Then numbers below 0 are refused, too, unless
+            the default is one, or the field's metadata has "signed".
 
     Raises:
-        ConfigError: a number is not finite, or a seed does not fit in 32 bits.
+        ConfigError: a number is not finite or too large, below 0, or a seed does not fit in 32 bits.
     """
     for f in dataclasses.fields(settings):
         name = prefix + (f.name.replace("_", "-") if dash else f.name)
         value = getattr(settings, f.name)
+        signed = f.metadata.get("signed") or (isinstance(f.default, int | float) and f.default < 0)
         for item in value if isinstance(value, tuple) else (value,):
+            if dash and isinstance(item, int | float) and not signed:
+                require(not item < 0, f"{name} is {item}; it is 0 or more")
             if dataclasses.is_dataclass(item):
                 check_numbers(item, f"{name}.", dash)
             elif isinstance(item, float):

@@ -43,8 +43,12 @@ class _Episode:
 def write_clips(path: Path | str, clips: Iterable[Mapping[str, Any] | Clip], test_share: float = 0.1) -> Store:
     """Writes a store of clips, as :func:`rsjax.write_store` documents it."""
     path = checked_path(path, "path")
+    try:
+        str(path).encode()
+    except UnicodeEncodeError as error:
+        raise StoreError(f"path is {str(path)!r:.80}; the files of a store need a path of text") from error
     if not isinstance(test_share, int | float) or not 0 <= test_share < 1:
-        raise StoreError(f"test_share is {test_share}; it is a share of the episodes, from 0 to below 1")
+        raise StoreError(f"test_share is {test_share!r:.80}; it is a share of the episodes, from 0 to below 1")
     if path.exists() and not (path / MANIFEST).exists():
         raise StoreError(f"{path}: exists and is not a store; move it away or choose another place")
     episodes: dict[str, _Episode] = {}

@@ -138,7 +138,7 @@ class TrainedModel:
             FileError: the disk is full or cannot be written to.
         """
         directory = checked_path(directory, "directory")
-        if dtype not in get_args(Dtype):
+        if not isinstance(dtype, str) or dtype not in get_args(Dtype):
             raise UserError(f"dtype is {dtype!r:.80}; choose {' or '.join(get_args(Dtype))}")
         if not isinstance(card, str):
             raise UserError(f"card is {type(card).__name__}; it is the text of README.md")

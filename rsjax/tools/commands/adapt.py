@@ -53,6 +53,7 @@ def main() -> None:
     options = parse_options(sys.argv[1:], PROG, Options.__doc__ or "", Options())
     if not options.policy and not options.episodes:
         raise ConfigError("name policies with --policy DIR, recorded episodes with --episodes STORE, or both")
+    from rsjax.data.store import open_store
     from rsjax.tools.policies.policy import load_policy
     from rsjax.tools.policies.run_data import RunData, named
     from rsjax.tools.policies.studies.adaptation import Behaviour, adapt, scores_of
@@ -62,6 +63,8 @@ def main() -> None:
     data = RunData(options.run, options.data_dir)
     check_takes_actions(data.config.model, f"{options.run}: the model")
     scores_of(data.run)  # raises before simulators start if the run was not evaluated
+    if options.episodes:
+        open_store(options.episodes)  # raises before simulators start if there is none
     trials = Trials(options.trials, options.max_steps, options.together)
     out = options.out or options.run.absolute().with_name(f"{options.run.absolute().name}-adapted")
     policies = {name: load_policy(place) for name, place in named(options.policy).items()}

@@ -89,7 +89,7 @@ def main() -> None:
     cutting = part(options, Cutting)
     settings = part(options, Finetuning)
     command = shlex.join([*PROG.split(), *sys.argv[1:]])
-    recordings = find_recordings(options.data)
+    recordings = find_recordings(options.data, cutting)
     source = find_source(options.model)
     run = finetune(source, recordings, cutting, settings, options.out, command, options.dry_run)
     if options.dry_run:

@@ -1,6 +1,6 @@
 """The clips of a fine-tuning: a store as it is, or recordings that are ingested with defaults that fit them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
@@ -34,24 +34,6 @@ class Recordings:
     path: Path
 
 
-def find_recordings(word: str) -> Recordings:
-    """Reads ``SOURCE:PATH``, or the path of a store of clips.
-
-    Raises:
-        UserError: it is neither, or nothing is there.
-    """
-    path = Path(word)
-    if (path / MANIFEST).exists():
-        return Recordings("", path)
-    source, colon, rest = word.partition(":")
-    if not colon or not rest:
-        raise UserError(
-            f"--data is {word!r}; write SOURCE:PATH, such as lerobot:/data/pusht (sources: {', '.join(FORMATS)}), or "
-            f"the path of a store that rsjax ingest made"
-        )
-    return Recordings(source, Path(rest))
-
-
 @dataclass(frozen=True)
 class Cutting:
     """How recordings become clips, as far as a user chose it.
@@ -74,6 +56,28 @@ class Cutting:
     validation_share: float = 0.1
     split_seed: int = 0
     workers: int = -1
+
+
+def find_recordings(word: str, cutting: Cutting) -> Recordings:
+    """Reads ``SOURCE:PATH``, or the path of a store of clips.
+
+    Raises:
+        UserError: it is neither, nothing is there, or options on how to cut recordings were given for a store.
+    """
+    path = Path(word)
+    if (path / MANIFEST).exists():
+        given = [f.name for f in fields(cutting) if getattr(cutting, f.name) != f.default]
+        if given:
+            flags = ", ".join(f"--{name.replace('_', '-')}" for name in given)
+            raise UserError(f"{flags}: say how recordings become clips, but {path} is a store of clips; leave them out")
+        return Recordings("", path)
+    source, colon, rest = word.partition(":")
+    if not colon or not rest:
+        raise UserError(
+            f"--data is {word!r}; write SOURCE:PATH, such as lerobot:/data/pusht (sources: {', '.join(FORMATS)}), or "
+            f"the path of a store that rsjax ingest made"
+        )
+    return Recordings(source, Path(rest))
 
 
 def ingest_options(

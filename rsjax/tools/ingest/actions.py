@@ -10,7 +10,7 @@ Axes: N recorded frames, T sampled frames, K rows between two of these, A record
 
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -72,7 +72,7 @@ class ActionConfig:
         kind: what the clip's actions are: ``recorded``, or ``delta`` of what was recorded as ``absolute``.
     """
 
-    offset: int = 0
+    offset: int = field(default=0, metadata={"signed": True})
     compose: Compose = "join"
     kind: Literal["recorded", "absolute", "delta"] = "recorded"
 

@@ -121,7 +121,7 @@ def test_the_tokenizer_is_kept_where_it_beats_the_first_frame(psnr: float, kept:
 
 def test_mistakes_are_one_line(model: Path, data: Path, tmp_path: Path) -> None:
     mistakes = {
-        "write SOURCE:PATH": lambda: find_recordings("/data/pusht"),
+        "write SOURCE:PATH": lambda: find_recordings("/data/pusht", Cutting()),
         "no model there": lambda: find_source(tmp_path),
         "has no episode": lambda: make_clips(Recordings("folder", tmp_path), CUTTING, find_source(model), tmp_path),
         "--rate or --frames": lambda: make_clips(

@@ -25,7 +25,7 @@ from rsjax.config import content_key
 from rsjax.data.codec import decode, encode
 from rsjax.errors import UserError
 from rsjax.evaluation.results import fingerprint
-from rsjax.files import read_json, regular, write_file
+from rsjax.files import checked_path, read_json, regular, write_file
 from rsjax.layers.group_norm import GroupNorm
 from rsjax.progress import Progress
 from rsjax.tools.policies.judges.judge import (
@@ -113,6 +113,7 @@ def load_judge(folder: Path, side: int | None = None) -> TrainedJudge:
     Raises:
         UserError: there is no judge, its file is damaged, or it does not take frames of that size.
     """
+    folder = checked_path(folder, "judge")
     path = folder / FILE
     report = folder / VALIDATION
     try:

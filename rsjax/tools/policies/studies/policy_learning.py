@@ -66,7 +66,8 @@ class Learning:
         cells += [Cell(f"real-{count}", count, 0) for count in counts]
         cells += [Cell(f"real-{most}-repeated", most, 0, 2), Cell(f"real-{most}-synthetic-{most}", most, most, 2)]
         if unknown := set(self.cells) - {cell.name for cell in cells}:
-            raise UserError(f"no cell {', '.join(sorted(unknown))}; there are {', '.join(cell.name for cell in cells)}")
+            names = ", ".join(map(repr, sorted(unknown)))
+            raise UserError(f"--cells: no cell {names}; there are {', '.join(cell.name for cell in cells)}")
         return [cell for cell in cells if not self.cells or cell.name in self.cells]
 
 

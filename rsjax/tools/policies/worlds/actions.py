@@ -21,10 +21,10 @@ class ActionError(UserError):
     """An action of the wrong shape, with a value that is not finite, or out of range. The message says which."""
 
 
-def check_out_of_range(value: str) -> None:
+def check_out_of_range(value: object) -> None:
     """Raises :class:`UserError` unless the value is one of ``OutOfRange``."""
-    if value not in get_args(OutOfRange):
-        raise UserError(f"out_of_range is {value!r}; it is clip or refuse")
+    if not isinstance(value, str) or value not in get_args(OutOfRange):
+        raise UserError(f"out_of_range is {value!r:.80}; it is clip or refuse")
 
 
 def check_takes_actions(model: ModelConfig, name: str = "the model") -> None:
