@@ -57,7 +57,6 @@ def main() -> None:
             f"sources: {', '.join(FORMATS)}"
         )
     options = parse_options(sys.argv[1:], PROG, Options.__doc__ or "", Options())
-    require(options.lines >= 0, f"--lines is {options.lines}; it is how many findings to print, 0 for all")
     from rich.console import Console
 
     from rsjax.processes import count_workers

@@ -263,7 +263,7 @@ def test_the_commands_status(
     assert run(monkeypatch, "rlds", tmp_path / "nowhere") == 2
     assert run(monkeypatch, "rlds", tmp_path / "data", "--option", "split") == 2
     assert run(monkeypatch, "rlds", tmp_path / "data", "--lines", "-1") == 2
-    assert "--lines is -1; it is how many findings to print, 0 for all" in capsys.readouterr().err
+    assert "--lines is -1; it is 0 or more" in capsys.readouterr().err
 
 
 def test_a_fix_that_keeps_nothing_says_what_to_do(

@@ -60,7 +60,7 @@ def test_each_cell_learns_from_its_demonstrations(tmp_path: Path, monkeypatch: p
     assert (out / "success.png").read_bytes().startswith(b"\x89PNG")
     with pytest.raises(UserError, match="9 demonstrations are asked for, there are 4"):
         learn(Learning((9,)), toy(), demos(4), demos(9), simulated(5), TRIALS, tmp_path / "more")
-    with pytest.raises(UserError, match="no cell real-7; there are synthetic-1"):
+    with pytest.raises(UserError, match="no cell .real-7.; there are synthetic-1"):
         Learning((1,), cells=("real-7",)).chosen()
 
 
