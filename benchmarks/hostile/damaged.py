@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from benchmarks.hostile.cases import Case, Ended, Place, command
-from benchmarks.hostile.options import LINES
+from benchmarks.hostile.options import LINES, OWN_END
 
 Damage = Callable[[Path, random.Random], None]
 
@@ -172,7 +172,10 @@ def cases() -> Iterator[Case]:
                 name = f"files: {pattern} {damage}, {reader}"
                 reason = next((why for part, why in DOCUMENTED.items() if part in name), "")
                 parts = [part for part in Path(pattern).parts if "*" not in part]
-                yield Case(name, _reading(pattern, act, reader, name), tuple(parts[-2:]), reason)
+                words = tuple(parts[-2:])
+                if reader in OWN_END:
+                    words = (*words, OWN_END[reader])
+                yield Case(name, _reading(pattern, act, reader, name), words, reason)
 
 
 def _reading(pattern: str, damage: Damage, reader: str, name: str) -> Callable[[Place], Ended]:

@@ -56,6 +56,7 @@ LINES = {
 }
 # Words of the error with which a line itself ends on the material, or on a machine without an optional package.
 OWN_END = {
+    "policy_learning": "ends in success",
     "improve": "ends in success",
     "hub push": "huggingface_hub",
     "hub pull": "huggingface_hub",
@@ -189,6 +190,8 @@ def _paths(name: str) -> Iterator[Case]:
             continue
         line = [*words[:place], path, *words[place + 1 :]]
         shown = (path.rpartition("/")[2][:20], words[place].rpartition("/")[2]) if path else ()
+        if not path.isprintable():
+            shown = (*shown, ascii(path)[1:-1])
         title = f"paths: {name} of a path that is {kind}"
         yield Case(title, _running_words(line), shown, _documented(name, "path", kind))
 

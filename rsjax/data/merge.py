@@ -92,7 +92,7 @@ def by_label(path: Path, column: str, folder: Path) -> dict[Path, Numbers]:
             continue
         labels = store.labels(name)
         if column not in labels.words:
-            raise StoreError(f"{path / MANIFEST}: no label {column!r}; it has {', '.join(labels.words)}")
+            raise StoreError(f"--by: {path / MANIFEST}: no label {column!r}; it has {', '.join(labels.words)}")
         for code, word in enumerate(labels.words[column]):
             numbers = parts.setdefault(folder / safe_id(word), {split: [] for split in store.splits})
             numbers[name] = (labels.codes[column] == code).nonzero()[0].tolist()

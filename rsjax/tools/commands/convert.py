@@ -92,6 +92,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         )
     if options.net is None and (options.source is None or options.out is None):
         raise ConfigError(f"name IN and OUT: {PROG} {options.kind} IN OUT (see {PROG} --help)")
+    require(options.heads is None or options.heads >= 1, f"--heads is {options.heads}; it is at least 1")
     require(options.net is None or options.heads_file is None, "--net has its own heads; leave out --heads-file")
     # JAX is loaded only now, after arguments are known to be good.
     from rsjax.tools.convert import cogvideox, genie, irasim, ivideogpt, kl_autoencoder, lpips, lpips_package, tokenizer

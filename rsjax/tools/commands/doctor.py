@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import tyro
 
-from rsjax.config import ConfigError, require
+from rsjax.config import ConfigError
 from rsjax.tools.commands.cli import main_errors, parse_options
 from rsjax.tools.ingest.formats import FORMATS
 

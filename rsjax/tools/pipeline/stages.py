@@ -8,6 +8,7 @@ from rsjax.data.curriculum import LoaderFactory, check_stages, loader_factory
 from rsjax.data.normalization import Normalization
 from rsjax.data.quarantine import NAME as QUARANTINE
 from rsjax.data.store import Store
+from rsjax.errors import UserError
 from rsjax.evaluation.metrics.lpips import advice
 from rsjax.evaluation.results import save_evaluation
 from rsjax.files import disk_guard
@@ -31,6 +32,8 @@ from rsjax.training.distributed import agree, barrier, is_lead, on_lead
 from rsjax.training.log import find_wandb
 from rsjax.training.loop import fit
 from rsjax.training.sharding import Sharding
+
+START_FIELDS: dict[Part, str] = {"tokenizer": "tokenizer_train.start_from", "world_model": "train.start_from"}
 
 
 def run_all(run: Run, resume: bool = True, command: str = "") -> None:
@@ -269,8 +272,11 @@ def pretrained_start(model: Any, start_from: str, part: Part) -> Callable[[Param
     """
     if not start_from:
         return None
-    directory = locate(start_from)
-    shapes = model.pretrained_shapes(directory)
+    try:
+        directory = locate(start_from)
+        shapes = model.pretrained_shapes(directory)
+    except UserError as error:
+        raise UserError(f"{START_FIELDS[part]}: {error}") from error
 
     def start(fresh: Params) -> Params:
         return model.start(fresh, load_part(directory, part, shapes), directory)

@@ -82,7 +82,7 @@ def add_result(root: Path, study: Path, claim: str, name: str = "") -> Path:
     source = study / RESULTS / f"{claim}.json"
     if not source.exists():
         known = [path.stem for path in (study / RESULTS).glob("*.json")]
-        raise UserError(f"{source}: no such file{did_you_mean(claim, known)} (rsjax paper writes it)")
+        raise UserError(f"--add {claim!r}: {source}: no such file{did_you_mean(claim, known)} (rsjax paper writes it)")
     path = root / DATA / f"{name or claim}.json"
     for suffix in (".json", ".npz"):
         path.with_suffix(suffix).unlink(missing_ok=True)

@@ -110,7 +110,10 @@ def _common(runs: Sequence[Path]) -> str:
     common = set.intersection(*(set(results_of(run)) for run in runs))
     chosen = sorted(common - {OWN} or common)
     labels = " ".join(map(str, runs))
-    require(bool(chosen), f"no protocol has evaluated all of them; rsjax evaluate {labels}")
+    require(
+        bool(chosen),
+        f"no protocol has evaluated all of them; rsjax evaluate {labels} does, or training (evaluation/result.json)",
+    )
     require(len(chosen) == 1, f"all of them have results of {' and of '.join(chosen)}; choose one with --protocol")
     return chosen[0]
 
