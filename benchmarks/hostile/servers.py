@@ -16,8 +16,10 @@ import msgpack
 import numpy as np
 
 from benchmarks.hostile.cases import Case, Ended, Place
+from rsjax.tools.play.viewer import SEARCHING
 
 SECONDS = 300.0  # for an answer; the first frame compiles
+PLANS = "the planner searches for seconds, and says so"
 TARGETS = {
     "a number of 4400 digits": "/api/clip/" + "9" * 4400 + ".webp",
     "a negative number": "/api/clip/-1.webp",
@@ -235,7 +237,8 @@ def cases() -> Iterator[Case]:
         for field, values in fields.items():
             for number, value in enumerate(values):
                 message = {"type": kind, "id": 1} | usual | {field: value}
-                yield Case(f"play: {kind}, {field} {number}: {_short(value)}", _message(json.dumps(message)))
+                name = f"play: {kind}, {field} {number}: {_short(value)}"
+                yield Case(name, _message(json.dumps(message)), accepted=PLANS if value == {"kind": "planner"} else "")
             yield Case(
                 f"play: {kind} without {field}",
                 _message(
@@ -343,6 +346,8 @@ def _message(data: str | bytes) -> Callable[[Place], Ended]:
                 answers = []
                 while True:
                     answer = _next(page)
+                    if answer["type"] == "status" and answer["text"] == SEARCHING:
+                        return Ended("began", SEARCHING)
                     answers.append(answer)
                     if answer.get("id") == 1001:
                         break

@@ -17,9 +17,11 @@ from rsjax.tools.play.tree import Branch, Node
 from rsjax.tools.policies.judges.judge_training import FOLDER
 from rsjax.tools.policies.judges.trained_judge import FILE
 from rsjax.tools.policies.planning.closed_loop import EnergyName, PlanSettings, actors
+from rsjax.tools.policies.planning.planner import PlannerConfig
 from rsjax.tools.policies.worlds.world import Actor
 
 KINDS = ("clip", "random", "policy", "planner")
+PLANNER = PlannerConfig()
 
 
 @dataclass
@@ -82,7 +84,7 @@ class Sources:
         if kind == "policy":
             assert self.run.policy is not None
             return self.run.policy.actor(session.seed)
-        settings = PlanSettings(methods=("cem",), energy=_energy(self.run))
+        settings = PlanSettings(PLANNER, methods=("cem",), energy=_energy(self.run))
         planner = actors(self.run.trained, self.run.data.run, settings)["cem"]
         return planner(session.seed, branch.nodes[0].state.rgb)
 

@@ -15,12 +15,16 @@ from rsjax.tools.play.messages import Refused
 from rsjax.tools.play.pictures import Place
 from rsjax.tools.play.points import points_of
 from rsjax.tools.play.session import Session
-from rsjax.tools.play.sources import Sources
+from rsjax.tools.play.sources import PLANNER, Sources
 from rsjax.tools.play.tree import Branch, Node
 from rsjax.tools.play.truth import Follower, Truths
 
 KINDS = ("depth", "uncertainty", "truth", "truth_depth", "points")
 BACKLOG = 8  # frames whose depth may wait; beyond that, new frames get no depth, but a page may ask for it later
+SEARCHING = (
+    f"the planner tries {PLANNER.rounds} × {PLANNER.candidates} sequences of {PLANNER.horizon} actions; "
+    f"its first two searches also compile …"
+)
 _TRUTHS = {"truth", "truth_depth"}
 
 
@@ -149,8 +153,15 @@ class Viewer:
         self.session.forget()
 
     async def sourced(self, branch: Branch, source: dict[str, Any]) -> Float[np.ndarray, " A"]:
-        """Returns a source's action that leads to a branch's next frame."""
-        return await asyncio.to_thread(self.sources.action, self.session, branch, source)
+        """Returns a source's action that leads to a branch's next frame; the page hears that a planner searches."""
+        searching = source.get("kind") == "planner"
+        if searching:
+            self.session.send({"type": "status", "text": SEARCHING, "busy": True})
+        try:
+            return await asyncio.to_thread(self.sources.action, self.session, branch, source)
+        finally:
+            if searching:
+                self.session.send({"type": "status", "text": "", "busy": False})
 
     async def show(self, number: int, frame: int, answered: int) -> None:
         """Sends a new frame, and starts to compute what else the page watches."""

@@ -13,7 +13,9 @@ import pytest
 from PIL import Image
 
 from rsjax.config import DataConfig
+from rsjax.tools.play import sources
 from rsjax.tools.play.play_run import PlayRun
+from rsjax.tools.play.viewer import SEARCHING
 from tests.tools.play.client import Client, Picture, Server
 from tests.tools.play.fake import LIGHT, MEASURED, Fakes
 from tests.waiting import wait_until
@@ -79,6 +81,22 @@ def test_a_policy_begins_anew_after_a_person_steered(
         page.ask("start", clip=0)
         made = [page.ask("step", branch=0, **each) for each in (policy, policy, {"action": [0] * 7}, policy, policy)]
         assert [each["action"][0] for each in made] == [0.1, 0.2, 0.0, 0.1, 0.2]
+
+
+def test_the_page_hears_that_the_planner_searches(
+    server: Server, run: PlayRun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def actors(*_: object) -> dict[str, Any]:
+        return {"cem": lambda seed, goal: lambda seen: np.full((1, run.controls.width), 0.5)}
+
+    monkeypatch.setattr(sources, "actors", actors)
+    monkeypatch.setattr(sources, "reasons", lambda run: dict.fromkeys(sources.KINDS, ""))
+    with server.client() as (page, _):
+        page.ask("start", clip=0)
+        made = page.ask("step", branch=0, source={"kind": "planner"})
+        assert made["action"][0] == 0.5
+        said = [(each["text"], each["busy"]) for each in page.pushed if each["type"] == "status"]
+        assert said[:2] == [(SEARCHING, True), ("", False)]
 
 
 def test_a_branch_that_went_nowhere_leaves_its_parent_as_it_was(server: Server, fakes: Fakes) -> None:
