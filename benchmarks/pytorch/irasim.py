@@ -74,7 +74,7 @@ class Final(nn.Module):
     def __init__(self, config: Architecture) -> None:
         super().__init__()
         self.norm_final = nn.LayerNorm(config.width, eps=1e-6, elementwise_affine=False)
-        self.linear = nn.Linear(config.width, config.patch_size**2 * config.channels)
+        self.linear = nn.Linear(config.width, config.patch_size**2 * config.inputs)
         self.adaLN_modulation = nn.Sequential(nn.SiLU(), nn.Linear(config.width, 2 * config.width))
 
     def forward(self, x: Tensor, condition: Tensor) -> Tensor:
@@ -95,7 +95,7 @@ class IRASimTorch(nn.Module):
         width = config.width
         video = config.conditioning == "video"
         patch = (config.patch_size, config.patch_size)
-        self.x_embedder = nn.ModuleDict({"proj": nn.Conv2d(config.channels, width, patch, patch)})
+        self.x_embedder = nn.ModuleDict({"proj": nn.Conv2d(config.inputs, width, patch, patch)})
         self.t_embedder = nn.ModuleDict(
             {"mlp": nn.Sequential(nn.Linear(TIME_CHANNELS, width), nn.SiLU(), nn.Linear(width, width))}
         )
@@ -133,8 +133,8 @@ class IRASimTorch(nn.Module):
         x = self.final_layer(x, plain.flatten(0, 1))
         p = cfg.patch_size
         rows, columns = cfg.grid
-        x = x.reshape(clips, frames, rows, columns, p, p, cfg.channels).permute(0, 1, 6, 2, 4, 3, 5)
-        return x.reshape(clips, frames, cfg.channels, rows * p, columns * p)
+        x = x.reshape(clips, frames, rows, columns, p, p, cfg.inputs).permute(0, 1, 6, 2, 4, 3, 5)
+        return x.reshape(clips, frames, cfg.inputs, rows * p, columns * p)
 
 
 def autoencoder(config: KLConfig) -> tuple[nn.Module, Any, Any]:
@@ -160,16 +160,21 @@ def autoencoder(config: KLConfig) -> tuple[nn.Module, Any, Any]:
 
 
 def create(config: Config, batch: int, horizon: int, device: str) -> TorchWork:
-    """Returns the work to time; sampling goes from pixels to pixels, in chunks as long as a clip."""
+    """Returns the work to time; sampling goes from pixels to pixels, in chunks as long as a clip.
+
+    With depth, the latents of its pictures are further channels of the frames', as in ours; encoding and decoding are
+    timed on pictures of either kind, and the terms of RGB and depth weigh the same.
+    """
     model = config.model
     clips = config.clips
     arch = architecture(config)
+    kinds = 1 + arch.depth  # of pictures, each with latents of its own
     assert isinstance(model, IRASimConfig)
     network = IRASimTorch(arch).to(device)
     vae, encode, decode = autoencoder(model.autoencoder)
     vae.to(device)
     left = torch.tensor(alphas(model.noise), dtype=torch.float32, device=device)[:, None, None, None, None]
-    latents = torch.randn(batch, arch.frames, arch.channels, arch.rows, arch.columns, device=device)
+    latents = torch.randn(batch, arch.frames, arch.inputs, arch.rows, arch.columns, device=device)
     actions = torch.randn(batch, arch.frames - 1, arch.action_inputs, device=device)
     images = torch.randn(batch * clips.frames, 3, clips.image_size, clips.image_size, device=device)
 
@@ -191,10 +196,10 @@ def create(config: Config, batch: int, horizon: int, device: str) -> TorchWork:
         return x
 
     def sample() -> Tensor:
-        made = encode(images[:batch])[:, None].float()
+        made = torch.cat([encode(images[:batch])] * kinds, 1)[:, None].float()
         while made.shape[1] < horizon:
             made = torch.cat([made, chunk(made[:, -1:])[:, 1:]], 1)
-        return decode(made[:, :horizon].flatten(0, 1))
+        return [decode(each.flatten(0, 1)) for each in made[:, :horizon].chunk(kinds, dim=2)]
 
     return TorchWork(
         trained=(network,),
@@ -203,7 +208,7 @@ def create(config: Config, batch: int, horizon: int, device: str) -> TorchWork:
         sample=sample,
         sampled=horizon - 1,
         encode=lambda: encode(images),
-        decode=lambda: decode(latents.flatten(0, 1)[: len(images)]),
+        decode=lambda: decode(latents[:, :, : arch.channels].flatten(0, 1)[: len(images)]),
         frames=len(images),
     )
 

@@ -15,11 +15,11 @@ For public weights that stay frozen, the stage has no steps: ``tokenizer_train.s
 """
 
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import jax
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float, UInt8
 
 from rsjax.clip import Video
 from rsjax.data.loader import Arrays, Transform
@@ -39,6 +39,17 @@ class VideoCodec(Protocol):
 
     def decode(self, tokens: dict[str, Any], has_depth: Bool[np.ndarray, " B"]) -> Video:
         """Inverts :meth:`encode`, with depth for the clips that have it if the codec encodes depth."""
+        ...
+
+
+@runtime_checkable
+class DepthCodec(Protocol):
+    """A codec that can encode depth maps, as pictures."""
+
+    def depth_pictures(
+        self, depth: Float[np.ndarray, "B T H W"]
+    ) -> tuple[UInt8[np.ndarray, "B T H W 3"], UInt8[np.ndarray, "B T H W 3"]] | None:
+        """Returns depth maps as pictures, and these encoded and decoded; None if it does not encode depth."""
         ...
 
 

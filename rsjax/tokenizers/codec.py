@@ -67,8 +67,13 @@ class Codec:
         Raises:
             UserError: no clip of the data has depth.
         """
-        colors = depth_to_color(depth, *self.normalization.require_depth_range(), self.config.depth_scale)
-        return self._chunked("encode", colors.astype(np.uint8))
+        return self._chunked("encode", self._colors(depth))
+
+    def depth_pictures(
+        self, depth: Float[np.ndarray, "B T H W"]
+    ) -> tuple[UInt8[np.ndarray, "B T H W 3"], UInt8[np.ndarray, "B T H W 3"]]:
+        """Returns the colour maps of depth in metres, and these encoded and decoded."""
+        return self._colors(depth), self.decode_rgb(self.encode_depth(depth))
 
     def decode_rgb(self, tokens: Grids) -> UInt8[np.ndarray, "*B H W 3"]:
         """Decodes tokens or codes to frames 0–255."""
@@ -83,6 +88,10 @@ class Codec:
         near, far = self.normalization.require_depth_range()
         colors = self._chunked("decode", np.asarray(tokens))
         return color_to_depth(colors, near, far, self.config.depth_scale)
+
+    def _colors(self, depth: Float[np.ndarray, "*B H W"]) -> UInt8[np.ndarray, "*B H W 3"]:
+        near_far = self.normalization.require_depth_range()
+        return depth_to_color(depth, *near_far, self.config.depth_scale).astype(np.uint8)
 
     def _chunked(self, method: Literal["encode", "decode"], images: np.ndarray) -> np.ndarray:
         def apply(chunk: np.ndarray) -> ArrayLike:

@@ -173,9 +173,7 @@ class KLCodec:
         has_depth = video.has_depth
         ours = {name: np.zeros_like(x) for name, x in made.items()}
         if video.depth is not None and has_depth.any():
-            limits = self.normalization.require_depth_range()
-            colors = depth_to_color(video.depth[has_depth], *limits, self.config.depth)
-            for name, x in self._posterior(colors.astype(np.uint8)).items():
+            for name, x in self._posterior(self._colors(video.depth[has_depth])).items():
                 ours[name][has_depth] = x
         return {name: np.concatenate([x, ours[name]], axis=-1) for name, x in made.items()}
 
@@ -190,6 +188,20 @@ class KLCodec:
         colors = self._images(latents[has_depth, ..., z:])
         metres[has_depth] = color_to_depth(colors, *self.normalization.require_depth_range(), self.config.depth)
         return Video(rgb, metres)
+
+    def depth_pictures(
+        self, depth: Float[np.ndarray, "B T H W"]
+    ) -> tuple[UInt8[np.ndarray, "B T H W 3"], UInt8[np.ndarray, "B T H W 3"]] | None:
+        """Returns the colour maps of depth in metres, and these encoded and decoded; None without ``config.depth``."""
+        if self.config.depth == "none":
+            return None
+        colors = self._colors(depth)
+        return colors, self._images(self._posterior(colors)["mean"])
+
+    def _colors(self, depth: Float[np.ndarray, "B T H W"]) -> UInt8[np.ndarray, "B T H W 3"]:
+        assert self.config.depth != "none"
+        near_far = self.normalization.require_depth_range()
+        return depth_to_color(depth, *near_far, self.config.depth).astype(np.uint8)
 
     def _posterior(self, images: UInt8[np.ndarray, "B T H W 3"]) -> dict[str, Float[np.ndarray, "B T h w z"]]:
         made = in_chunks(partial(self._run, _encode), images, 3, images_per_pass(images.shape[-2]))

@@ -49,6 +49,15 @@ def video(config: Config, size: int, frames: int) -> Video:
     return Video(np.random.default_rng(0).integers(0, 256, (size, frames, side, side, 3), np.uint8))
 
 
+def prompt_video(config: Config, size: int, frames: int) -> Video:
+    """Returns random frames with depth if the model learns from it."""
+    rgb = video(config, size, frames).rgb
+    if not config.model.uses_depth:
+        return Video(rgb)
+    near, far = normalization(config).require_depth_range()
+    return Video(rgb, np.random.default_rng(1).uniform(near, far, rgb.shape[:-1]).astype(np.float32))
+
+
 def arrays(model: WorldModel[Any], config: Config, size: int) -> Arrays:
     """Returns the stacked arrays of ``size`` random records."""
     rng = np.random.default_rng(0)

@@ -145,7 +145,7 @@ def _sample_pixels(config: Config, batch: int, budget: float, horizons: tuple[in
     params = jax.jit(model.init)(jax.random.key(0))
     numbers: Numbers = {"sample_prompt_frames": PROMPT_FRAMES}
     for frames in horizons:
-        prompt = inputs.video(config, batch, PROMPT_FRAMES)
+        prompt = inputs.prompt_video(config, batch, PROMPT_FRAMES)
         actions = np.random.default_rng(1).normal(size=(batch, frames, config.clips.action_dim)).astype(np.float32)
         run = partial(model.generate, params, assets, prompt, actions)
         numbers[f"sample_s_per_frame_{frames}"] = median_seconds(run, budget) / (frames - PROMPT_FRAMES)

@@ -61,7 +61,8 @@ def bench(
             if name != "torch":  # jax does not see torch's memory on an accelerator
                 peak[f"{name}_peak_memory_bytes"] = peak["peak_memory_bytes"]
             numbers.update(measured | peak)
-            numbers.update(ratios(numbers, config.model.uses_depth))
+            branches = config.model.uses_depth and config.model.family == "roboscape"
+            numbers.update(ratios(numbers, branches))
             keep(dict(numbers))
 
         for name in PARTS:

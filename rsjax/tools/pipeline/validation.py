@@ -15,7 +15,6 @@ from jaxtyping import UInt8
 
 from rsjax.clip import Video
 from rsjax.data.clips import Clips, load_clips, readable, spread
-from rsjax.data.depth_color import depth_to_color
 from rsjax.data.loader import Arrays
 from rsjax.data.normalization import Normalization
 from rsjax.data.store import RecordSource, Store
@@ -24,7 +23,7 @@ from rsjax.evaluation.registry import Scene, Unavailable, metrics
 from rsjax.evaluation.shown import REPORT_CLIPS
 from rsjax.models.base import Assets, WorldModel, create_autoencoder, create_model
 from rsjax.models.load_run import load_tokenizer
-from rsjax.tokenizers.codec import Codec
+from rsjax.tokenizers.autoencoder import DepthCodec
 from rsjax.tools.pipeline.run import Run
 from rsjax.tools.studies.report.figures import ClipFigure, filmstrip
 from rsjax.trainable import Params
@@ -146,10 +145,11 @@ class TokenizerValidation:
         of_rgb = _psnr(clips.rgb, rgb)
         metric = -of_rgb
         scalars = {"validation/psnr": of_rgb}
-        if isinstance(codec, Codec) and clips.has_depth.any() and self._normalization.depth_range:
-            true = clips.depth[clips.has_depth]
-            colors = depth_to_color(true, *self._normalization.depth_range, cfg.tokenizer.depth_scale).astype(np.uint8)
-            depth = codec.decode_rgb(codec.encode_depth(true))
+        pair = None
+        if isinstance(codec, DepthCodec) and clips.has_depth.any() and self._normalization.depth_range:
+            pair = codec.depth_pictures(clips.depth[clips.has_depth])
+        if pair is not None:
+            colors, depth = pair
             for row, number in enumerate(clips.index[clips.has_depth]):
                 shown[number].append((colors[row], depth[row]))
             scalars["validation/psnr_depth"] = of_depth = _psnr(colors, depth)

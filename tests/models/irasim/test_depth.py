@@ -14,9 +14,11 @@ import pytest
 from rsjax.clip import Video
 from rsjax.config import Config, content_key, presets
 from rsjax.config.config_fields import with_values
+from rsjax.data.depth_color import color_to_depth, depth_to_color
 from rsjax.data.normalization import Normalization
 from rsjax.data.store import Store
 from rsjax.errors import UserError
+from rsjax.evaluation.metrics.psnr import psnr
 from rsjax.models.base import create_autoencoder, create_model
 from rsjax.models.irasim.autoencoder import KLCodec
 from rsjax.models.irasim.config import KLConfig
@@ -26,6 +28,8 @@ from rsjax.tools.convert.directory import save
 from rsjax.tools.convert.files import ConvertError
 from rsjax.tools.convert.irasim import export
 from rsjax.tools.describe import count
+from rsjax.tools.pipeline.run import Run
+from rsjax.tools.pipeline.validation import TokenizerValidation
 from rsjax.trainable import StepContext
 from tests.models.irasim import toy
 from tests.tools.pipeline import toy as clips
@@ -144,6 +148,25 @@ def test_a_clip_without_depth_counts_in_the_term_of_rgb_alone() -> None:
     assert fewer["depth"][0] < whole["depth"][0]
     none = terms(np.zeros(3, np.float32), batch["latents"])
     assert none["depth"] == (0, 0)
+
+
+def test_depth_is_scored_in_the_validation_of_the_autoencoder_too(tmp_path: Path) -> None:
+    run = Run(DEPTH, tmp_path / "run", tmp_path / "data")
+    store = clips.store(run.clips)
+    depth = np.stack([store.source("test")[number]["depth"] for number in range(clips.TEST)])
+    ours = codec(DEPTH.autoencoder, store)
+    pictures = ours.depth_pictures(depth)
+    assert pictures is not None
+    colors, decoded = pictures
+    np.testing.assert_array_equal(colors, depth_to_color(depth, *clips.DEPTH_RANGE, "inverse").astype(np.uint8))
+    both = Video(np.zeros_like(colors), depth)
+    made = ours.decode(ours.encode(both), both.has_depth)
+    np.testing.assert_array_equal(color_to_depth(decoded, *clips.DEPTH_RANGE, "inverse"), made.depth)
+    found = TokenizerValidation(run)(3, ours.params)
+    of_depth = float(psnr(colors, decoded).mean())
+    assert found.scalars["validation/psnr_depth"] == pytest.approx(of_depth)
+    assert found.metric == pytest.approx(-(found.scalars["validation/psnr"] + of_depth) / 2)
+    assert codec(toy.AUTOENCODER, store).depth_pictures(depth) is None
 
 
 def test_public_files_know_no_depth(tmp_path: Path) -> None:
