@@ -34,10 +34,8 @@ SKIPPED = "skipped.jsonl"
 WANDB_ID = "wandb.json"
 GIB = 2.0**30
 # Scalars that measure the machine: they differ between any two runs.
-MEASURED = frozenset(
-    {"seconds_per_step", "data_wait_share", "frames_per_second", "images_per_second"}
-    | {"device_gib", "device_peak_gib", "host_gib"}
-)
+MEASURED = frozenset({"seconds_per_step", "data_wait_share", "device_gib", "device_peak_gib", "host_gib"})
+RATE = "_per_second"  # ends the names of others, such as frames_per_second
 
 
 def read_rows(path: Path) -> list[dict[str, Any]]:
@@ -61,7 +59,10 @@ def read_log(directory: Path) -> list[dict[str, Any]]:
 
 def read_curve(directory: Path) -> list[dict[str, Any]]:
     """Reads the log without machine measurements: an interrupted run gives the same rows as an uninterrupted one."""
-    return [{k: v for k, v in row.items() if k not in MEASURED} for row in read_log(directory)]
+    return [
+        {name: value for name, value in row.items() if name not in MEASURED and not name.endswith(RATE)}
+        for row in read_log(directory)
+    ]
 
 
 class ScalarLog:

@@ -100,7 +100,7 @@ def test_an_image_is_saved_unchanged_under_its_step(tmp_path: Path) -> None:
 
 def test_machine_measurements_are_not_in_the_curve(tmp_path: Path) -> None:
     with ScalarLog(tmp_path, 0) as log:
-        log.write(1, {"loss": 0.5} | dict.fromkeys(MEASURED, 1.0))
+        log.write(1, {"loss": 0.5} | dict.fromkeys([*MEASURED, "frames_per_second", "samples_per_second"], 1.0))
     assert read_curve(tmp_path) == [{"step": 1, "loss": 0.5}]
 
 
