@@ -20,7 +20,7 @@ RENAMED = {  # what LeRobot's policies call openpi's keys
 
 def opened(folder: Path) -> Any:
     """The demonstrations as LeRobot opens them, in the version that it reads."""
-    datasets = pytest.importorskip("lerobot.datasets.lerobot_dataset", reason="LeRobot is not installed")
+    datasets = pytest.importorskip("lerobot.datasets.lerobot_dataset", reason="LeRobot is missing (docs/lerobot.md)")
     root = folder / "libero"
     export_libero(root, DemonstrationOptions(demos=1, size=64, version=datasets.CODEBASE_VERSION))
     later = {"actions": [step / 20 for step in range(HORIZON)]}
