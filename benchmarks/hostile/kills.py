@@ -129,6 +129,7 @@ def kill(words: list[str], folder: Path, options: Options, name: str) -> tuple[f
         if len(moments) == options.kills:
             break
         moment = rng.uniform(0.1, shortest)
+        anew = not new.exists()
         began = time.monotonic()
         attempt = Attempt(command, [folder], log)
         try:
@@ -139,7 +140,8 @@ def kill(words: list[str], folder: Path, options: Options, name: str) -> tuple[f
             continue
         if attempt.process.returncode:
             return seconds, moments, [f"exit status {attempt.process.returncode} after {len(moments)} kills; see {log}"]
-        shortest = min(shortest, time.monotonic() - began)  # what was compiled or done before saved it time
+        if anew:
+            shortest = min(shortest, time.monotonic() - began)  # what was compiled before saves it time
         shutil.rmtree(new)  # once more from the beginning
     if not new.exists() or name != "export":  # an export that is there is whole, and refuses another one
         status = _to_the_end(command, log)

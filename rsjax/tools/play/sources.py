@@ -48,7 +48,7 @@ class Sources:
         """Returns the action that leads to a branch's next frame. This may be slow: a planner tries many actions.
 
         Raises:
-            Refused: the source is missing, or has no action for this frame.
+            Refused: the source is missing or damaged, or has no action for this frame.
         """
         kind = choice(source, "kind", KINDS)
         frame = len(branch.nodes)
@@ -60,7 +60,10 @@ class Sources:
             return self.run.controls.random(np.random.default_rng([session.seed, branch.draw, frame]))
         acting = self.acting.get(branch.number)
         if acting is None or acting.kind != kind or acting.last is not branch.nodes[-1]:
-            acting = self.acting[branch.number] = Acting(kind, self._actor(kind, session, branch))
+            try:
+                acting = self.acting[branch.number] = Acting(kind, self._actor(kind, session, branch))
+            except UserError as error:
+                raise Refused("no_source", str(error)) from error
         return np.asarray(acting.act(_seen(session, branch.nodes[-1])), np.float32)[0]
 
     def acted(self, branch: Branch, source: dict[str, Any] | None) -> None:

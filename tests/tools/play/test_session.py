@@ -13,9 +13,10 @@ import pytest
 from PIL import Image
 
 from rsjax.config import DataConfig
-from rsjax.tools.play import sources
 from rsjax.tools.play.play_run import PlayRun
 from rsjax.tools.play.viewer import SEARCHING
+from rsjax.tools.policies.judges.judge_training import FOLDER
+from rsjax.tools.policies.judges.trained_judge import FILE
 from tests.tools.play.client import Client, Picture, Server
 from tests.tools.play.fake import LIGHT, MEASURED, Fakes
 from tests.waiting import wait_until
@@ -83,20 +84,17 @@ def test_a_policy_begins_anew_after_a_person_steered(
         assert [each["action"][0] for each in made] == [0.1, 0.2, 0.0, 0.1, 0.2]
 
 
-def test_the_page_hears_that_the_planner_searches(
-    server: Server, run: PlayRun, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def actors(*_: object) -> dict[str, Any]:
-        return {"cem": lambda seed, goal: lambda seen: np.full((1, run.controls.width), 0.5)}
-
-    monkeypatch.setattr(sources, "actors", actors)
-    monkeypatch.setattr(sources, "reasons", lambda run: dict.fromkeys(sources.KINDS, ""))
+def test_the_page_hears_that_the_planner_searches_and_why_it_cannot(server: Server, run: PlayRun) -> None:
+    judge = run.data.run / FOLDER / FILE
+    judge.parent.mkdir()
+    judge.write_bytes(b"no judge")
     with server.client() as (page, _):
         page.ask("start", clip=0)
         made = page.ask("step", branch=0, source={"kind": "planner"})
-        assert made["action"][0] == 0.5
         said = [(each["text"], each["busy"]) for each in page.pushed if each["type"] == "status"]
-        assert said[:2] == [(SEARCHING, True), ("", False)]
+    judge.unlink()
+    assert made["error"] == "no_source" and f"{judge}: damaged" in made["message"]
+    assert said == [(SEARCHING, True), ("", False)]
 
 
 def test_a_branch_that_went_nowhere_leaves_its_parent_as_it_was(server: Server, fakes: Fakes) -> None:
