@@ -289,7 +289,7 @@ MODEL = "rsjax/WorldModel-v0"
 ENVIRONMENTS: dict[str, Callable[[Place, Any], object]] = {
     **{
         f"make, {name}": _making(MODEL, name)
-        for name in ("run", "data_dir", "store", "split", "max_steps", "judge", "out_of_range", "ofenrohr")
+        for name in ("run", "data_dir", "store", "split", "max_steps", "judge", "out_of_range", "depth", "ofenrohr")
     },
     **{f"vector environment, {name}": _vector(name) for name in ("run", "num_envs", "max_steps", "judge", "split")},
     "reset, seed": lambda place, value: _env(place).reset(seed=value),

@@ -12,8 +12,6 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from rsjax.layers.unstacked_params import block_part
-
 FEW = 2  # frames per pass of a rollout
 
 
@@ -124,25 +122,17 @@ def frames_held(slots: int, last: Int[Array, ""] | int) -> Int[Array, " slots"]:
     return last - (last - jnp.arange(slots)) % slots
 
 
-def put_frames(cache: Any, new: Any, start: Any, ring: bool) -> Any:
-    """Returns a cache into which new frames from ``start`` on are written; both have a leading axis over blocks.
+def put_frames(
+    old: Float[Array, "*L B S h N e"], fresh: Float[Array, "*L B S h T e"], start: Any, ring: bool
+) -> Float[Array, "*L B S h N e"]:
+    """Returns a cache's keys or values with new frames from ``start`` on.
 
     Args:
-        cache: a tree of :class:`KeyValues`, or :func:`rsjax.layers.unstacked_params.apart` of it.
-        new: a tree of the same structure with the new frames.
         ring: whether positions beyond the number of slots wrap around.
     """
-
-    if isinstance(cache, list):
-        return [put_frames(old, block_part(new, i), start, ring) for i, old in enumerate(cache)]
-
-    def put(old: Float[Array, "*L B S h N e"], fresh: Float[Array, "*L B S h T e"]) -> Float[Array, "*L B S h N e"]:
-        fresh = fresh.astype(old.dtype)
-        if not ring:
-            return jax.lax.dynamic_update_slice_in_dim(old, fresh, start, axis=-2)
-        for i in range(fresh.shape[-2]):  # frame by frame, since the slots may wrap around
-            slot = (start + i) % old.shape[-2]
-            old = jax.lax.dynamic_update_slice_in_dim(old, fresh[..., i : i + 1, :], slot, axis=-2)
-        return old
-
-    return jax.tree.map(put, cache, new)
+    if not ring:
+        return jax.lax.dynamic_update_slice_in_dim(old, fresh, start, axis=-2)
+    for i in range(fresh.shape[-2]):  # frame by frame, since the slots may wrap around
+        slot = (start + i) % old.shape[-2]
+        old = jax.lax.dynamic_update_slice_in_dim(old, fresh[..., i : i + 1, :], slot, axis=-2)
+    return old

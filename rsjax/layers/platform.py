@@ -15,10 +15,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rsjax.layers import accelerator
+from rsjax.layers import accelerator, attention
 from rsjax.layers.attention import KeyValues, attend, attend_cached, unpacked
 from rsjax.layers.cpu import convolution, frame_attention
 from rsjax.layers.cpu import matmul as cpu_matmul
+from rsjax.layers.cpu.cache import put_clip_by_clip
 from rsjax.layers.gpu import attention as gpu
 from rsjax.layers.gpu import cached_attention as gpu_cached
 from rsjax.layers.gpu import feed_forward as gpu_feed_forward
@@ -27,6 +28,7 @@ from rsjax.layers.gpu import norm_linear as gpu_norm_linear
 from rsjax.layers.parameters import Linear, Norm
 from rsjax.layers.partition import devices_are_known
 from rsjax.layers.tpu import attention as tpu
+from rsjax.layers.unstacked_params import block_part
 
 
 def by_platform(cpu: Callable[..., Any], accelerator: Callable[..., Any], *operands: Any) -> Any:
@@ -44,6 +46,51 @@ def in_feature_dtype(dtype: str, run: Callable[[str], Any]) -> Any:
     if dtype == "float32":
         return run(dtype)
     return by_platform(partial(run, "float32"), partial(run, dtype))
+
+
+def known_after(x: Float[Array, "..."], number: Any) -> Any:
+    """Returns a whole number that, if it is traced, a program for a CPU knows only when it has computed x.
+
+    A cache that is written at this place is then written in place, after all that x depends on has read it. XLA would
+    order neither by itself, nor by a barrier, and copy the cache.
+    """
+    if not isinstance(number, Array):
+        return number
+
+    def late(x: Array, number: Array) -> Array:
+        return number + jnp.isnan(x.reshape(-1)[0])  # 0; for NaN the place does not matter
+
+    return by_platform(late, lambda x, number: number, x, number)
+
+
+def put_frames(cache: Any, new: Any, start: Any, ring: bool) -> Any:
+    """Returns a cache into which new frames from ``start`` on are written; both have a leading axis over blocks.
+
+    Args:
+        cache: a tree of :class:`KeyValues`, or :func:`rsjax.layers.unstacked_params.apart` of it.
+        new: a tree of the same structure with the new frames.
+        ring: whether positions beyond the number of slots wrap around.
+    """
+    if isinstance(cache, list):
+        return [put_frames(old, block_part(new, i), start, ring) for i, old in enumerate(cache)]
+    each = jax.custom_batching.custom_vmap(partial(attention.put_frames, ring=ring))
+
+    @each.def_vmap
+    def _(clips: int, batched: list[bool], *operands: Array) -> tuple[Array, bool]:
+        mapped = jax.vmap(partial(attention.put_frames, ring=ring))
+        x = [
+            y if of_clips else jnp.broadcast_to(y, (clips, *y.shape))
+            for y, of_clips in zip(operands, batched, strict=True)
+        ]
+        return by_platform(partial(put_clip_by_clip, ring=ring), mapped, *x), True
+
+    def put(old: Array, fresh: Array) -> Array:
+        if not isinstance(start, Array):
+            return attention.put_frames(old, fresh.astype(old.dtype), start, ring)
+        written: Array = each(old, fresh.astype(old.dtype), start)
+        return written
+
+    return jax.tree.map(put, cache, new)
 
 
 def attend_in_clip(

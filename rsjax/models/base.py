@@ -220,8 +220,12 @@ class WorldModel(Trainable[B], Protocol[B]):
         video = self.generate(params, assets, repeated, actions, index=alike, depth=depth)
         return video if last is None else video.frames(-last)
 
-    def imagine(self, params: Params, assets: Assets, clips: int) -> Imagination:
+    def imagine(self, params: Params, assets: Assets, clips: int, depth: bool = True) -> Imagination:
         """Returns clips that are generated frame by frame; they equal those that :meth:`generate` makes at once.
+
+        Args:
+            clips: their number.
+            depth: whether frames have depth, if the model generates it.
 
         Raises:
             UserError: the family does not implement it.

@@ -13,9 +13,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
 from rsjax.config import ClipShape
-from rsjax.layers.attention import KeyValues, attend_parts, put_frames, rotate
+from rsjax.layers.attention import KeyValues, attend_parts, rotate
 from rsjax.layers.dense import Dense
-from rsjax.layers.platform import attend_cells
+from rsjax.layers.platform import attend_cells, put_frames
 from rsjax.layers.unstacked_params import together
 from rsjax.models.ivideogpt.config import IVideoGPTConfig
 from rsjax.models.ivideogpt.sequence import Layout

@@ -1,6 +1,9 @@
 """Generates frame by frame from pixels to pixels: one compiled program decodes the tokens, and then their pictures.
 
-Axes: B clips, N of them, S cells, A action dimensions.
+On a CPU the program takes ``GROUP`` clips, and groups run at the same time. The features of so few clips stay in the
+processor's cache, a window that is full costs its own group alone, and one program serves any number of clips.
+
+Axes: B clips, N of them, G clips of a group, S cells, A action dimensions.
 """
 
 from dataclasses import replace
@@ -16,75 +19,138 @@ from rsjax.clip import Video
 from rsjax.config import SampleConfig, TokenizerConfig, TokenModelConfig
 from rsjax.data.depth_color import color_to_depth
 from rsjax.data.normalization import Normalization, with_sums
+from rsjax.devices import on_cpu
+from rsjax.layers.unstacked_params import apart
 from rsjax.models.roboscape.architecture import Architecture
-from rsjax.models.roboscape.sample import CLIPS, State, start, step, where, with_few_launches
-from rsjax.tokenizers.codec import Codec
+from rsjax.models.roboscape.sample import (
+    CLIPS,
+    State,
+    clip_axes,
+    for_many_passes,
+    renewed,
+    start,
+    step,
+    stride,
+    where,
+    window_start,
+    with_few_launches,
+)
+from rsjax.tokenizers.codec import Codec, each_pass
 from rsjax.tokenizers.magvit2 import run_tokenizer
 from rsjax.trainable import Params
+
+GROUP = 8
 
 
 class TokenImagination:
     """Implements :class:`rsjax.models.base.Imagination`. Frames have depth if the model and its training clips have it.
 
+    Args:
+        clips: their number.
+        depth: False: depth is generated, since later frames depend on it, but not decoded to metres.
+
     Raises:
         ConfigError: the model does not support these sampling settings.
     """
 
-    def __init__(self, config: TokenModelConfig, arch: Architecture, codec: Codec, params: Params, clips: int) -> None:
+    def __init__(
+        self,
+        config: TokenModelConfig,
+        arch: Architecture,
+        codec: Codec,
+        params: Params,
+        clips: int,
+        depth: bool = True,
+    ) -> None:
         arch.check_sampling(config.sample)
         self._config = config
         self._arch = arch
         self._codec = codec
-        self._params = params
+        self._params = jax.jit(for_many_passes, static_argnums=0)(arch, params)
         self._has_depth = arch.depth != "none" and codec.normalization.depth_range is not None
-        self._state: State | None = None
+        self._shows_depth = self._has_depth and depth
+        self._size = clips
+        if on_cpu():
+            self._size = min(clips, GROUP)
+        self._states: list[State | None] = [None] * -(-clips // self._size)
+        self._positions = np.zeros(clips, int)  # the next frame's in each window
         self._sums = np.zeros((clips, len(codec.normalization.action_mean)))
 
     def restart(self, which: Bool[np.ndarray, " B"], first: Video, index: Int[np.ndarray, " N"]) -> Video:
         video = first if self._has_depth else Video(first.rgb)
         grids = self._codec.encode(video)
-        rows = np.zeros(len(which), int)  # of all clips; those that go on take any
+        count = len(which)
+        rows = np.zeros(count, int)  # of all clips; those that go on take any
         rows[which] = np.arange(len(first))
-        tokens = {name: jnp.asarray(grid.reshape(len(first), 1, -1)[rows]) for name, grid in grids.items()}
+        tokens = {name: grid.reshape(len(first), 1, -1) for name, grid in grids.items()}
         if self._arch.depth != "none":
-            tokens.setdefault("depth", jnp.zeros_like(tokens["rgb"]))
-        keys = jax.vmap(partial(jax.random.fold_in, jax.random.key(self._config.sample.seed)))(jnp.asarray(index)[rows])
+            tokens.setdefault("depth", np.zeros_like(tokens["rgb"]))
+        keys = jax.vmap(partial(jax.random.fold_in, jax.random.key(self._config.sample.seed)))(jnp.asarray(index))
         hidden = None
         if self._arch.depth != "none" and not self._has_depth:
-            hidden = jnp.ones(len(which), bool)
-        fresh = _start(self._arch, self._config.sample, self._params, tokens, keys, hidden)
-        if self._state is None:
-            self._state = fresh
-        else:
-            self._state = _restarted(jnp.asarray(which), fresh, self._state)
+            hidden = jnp.ones(self._size, bool)
+        for number, old in enumerate(self._states):
+            lanes = self._lanes(number, count)
+            if old is not None and not which[lanes].any():
+                continue
+            cells = {name: jnp.asarray(grid[rows[lanes]]) for name, grid in tokens.items()}
+            fresh = _start(self._arch, self._config.sample, self._params, cells, keys[rows[lanes]], hidden)
+            if old is None:
+                self._states[number] = fresh
+            else:
+                self._states[number] = _restarted(jnp.asarray(which[lanes]), fresh, old)
+        self._positions[which] = 1 - int(window_start(self._arch, self._config.sample, 1))
         self._sums[which] = 0
-        video = self._codec.decode(grids, np.full(len(first), self._has_depth))
-        return replace(video, state=_readings(fresh, which))
+        video = self._codec.decode(grids, np.full(len(first), self._shows_depth))
+        return replace(video, state=self._readings(which))
 
     def step(self, actions: Float[np.ndarray, "B A"]) -> Video:
-        assert self._state is not None, "restart the clips first"
         scaled = self._codec.normalization.scaled(actions)
         self._sums += scaled
         rows = with_sums(scaled, self._sums if self._config.departures.integrate_actions else None)
-        self._state, rgb, depth = _step(
-            self._arch,
-            self._config.sample,
-            self._codec.config,
-            self._codec.normalization if self._has_depth else None,
-            self._params,
-            self._codec.params,
-            self._state,
-            rows,
-        )
-        frames = None if depth is None else np.asarray(depth)[:, None]
-        return Video(np.asarray(rgb)[:, None], frames, state=_readings(self._state))
+        count = len(rows)
+        full = np.zeros(count, bool)
+        if not self._arch.departures.rotary:
+            full = self._positions == self._arch.frames
+            self._positions[full] -= stride(self._arch, self._config.sample)
+        self._positions += 1
 
+        def run(number: int) -> tuple[np.ndarray, np.ndarray | None]:
+            state = self._states[number]
+            assert state is not None, "restart the clips first"
+            lanes = self._lanes(number, count)
+            if full[lanes].any():
+                state = _renewed(self._arch, self._config.sample, self._params, state, jnp.asarray(full[lanes]))
+            self._states[number], rgb, depth = _step(
+                self._arch,
+                self._config.sample,
+                self._codec.config,
+                self._codec.normalization if self._shows_depth else None,
+                self._params,
+                self._codec.params,
+                state,
+                rows[lanes],
+            )
+            return np.asarray(rgb), None if depth is None else np.asarray(depth)
 
-def _readings(states: State, which: Any = slice(None)) -> Float[np.ndarray, "N 1 3"] | None:
-    """Returns what the state heads read from the last frames of a stack of clips; None without heads."""
-    if states.readings is None:
-        return None
-    return np.asarray(states.readings)[which]
+        made = each_pass(run, range(len(self._states)))
+        rgb = np.concatenate([frames for frames, _ in made])[:count, None]
+        depths = [metres for _, metres in made if metres is not None]
+        depth = None
+        if depths:
+            depth = np.concatenate(depths)[:count, None]
+        return Video(rgb, depth, state=self._readings(slice(None)))
+
+    def _lanes(self, number: int, count: int) -> Int[np.ndarray, " G"]:
+        """Returns the clips of a group; the last clip fills what is left over."""
+        return np.minimum(np.arange(number * self._size, (number + 1) * self._size), count - 1)
+
+    def _readings(self, which: Any) -> Float[np.ndarray, "N 1 3"] | None:
+        """Returns what the state heads read from the last frames of clips; None without heads."""
+        read = [states.readings for states in self._states if states is not None and states.readings is not None]
+        if not read:
+            return None
+        return np.concatenate([np.asarray(each) for each in read])[: len(self._sums)][which]
 
 
 @partial(jax.jit, static_argnums=(0, 1))
@@ -105,14 +171,21 @@ def _start(
         return start(arch, sample, params, cells, actions, key[None], hidden)
 
     stacked: State = jax.vmap(start_clip, out_axes=CLIPS)(tokens, keys, no_depth)
-    return stacked
+    return replace(stacked, cache=apart(stacked.cache, arch.groups, arch.unroll))
 
 
 @jax.jit
 def _restarted(which: Bool[Array, " B"], fresh: State, old: State) -> State:
     """Returns the fresh states of the clips ``which``, and the old ones of the others."""
-    stacked: State = jax.vmap(where, (0, CLIPS, CLIPS), CLIPS)(which, fresh, old)
+    axes = clip_axes(old)
+    stacked: State = jax.vmap(where, (0, axes, axes), axes)(which, fresh, old)
     return stacked
+
+
+@partial(jax.jit, static_argnums=(0, 1), donate_argnums=(3,))
+def _renewed(arch: Architecture, sample: SampleConfig, params: Params, state: State, full: Bool[Array, " B"]) -> State:
+    """Returns a stack of states whose full windows have moved: a program of its own, since few steps need it."""
+    return renewed(arch, sample, params, state, full)
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2, 3), donate_argnums=(6,))
@@ -127,11 +200,13 @@ def _step(
     actions: Float[Array, "B A"],
 ) -> tuple[State, Array, Array | None]:
     """Returns the state after the next frame, and the frame: uint8, and metres if ``normalization`` is given."""
-    state, frame = with_few_launches(arch, lambda arch: step(arch, sample, params, state, actions[:, None]))
+    state, frame = with_few_launches(
+        arch, lambda arch: step(arch, sample, params, state, actions[:, None], beyond=False)
+    )
 
     def pixels(branch: str) -> Array:
-        grid = frame[branch].reshape(len(actions), arch.grid, arch.grid, *frame[branch].shape[3:])
-        return cast(Array, run_tokenizer(tokenizer, tokenizer_params, grid, "decode"))
+        grids = frame[branch].reshape(len(actions), arch.grid, arch.grid, *frame[branch].shape[3:])
+        return cast(Array, run_tokenizer(tokenizer, tokenizer_params, grids, "decode"))
 
     rgb = jnp.round(pixels("rgb")).astype(jnp.uint8)
     if normalization is None or normalization.depth_range is None:

@@ -201,8 +201,8 @@ class RoboScape(WorldModel[Batch]):
             made = {branch: grid[:, -last:] for branch, grid in made.items()}
         return self._video(assets, made, np.repeat(has_depth & depth, candidates))
 
-    def imagine(self, params: Params, assets: Assets, clips: int) -> TokenImagination:
-        return TokenImagination(self.config, self.architecture, self._codec(assets), params, clips)
+    def imagine(self, params: Params, assets: Assets, clips: int, depth: bool = True) -> TokenImagination:
+        return TokenImagination(self.config, self.architecture, self._codec(assets), params, clips, depth)
 
     def branching(self, params: Params, assets: Assets, has_depth: bool, lanes: int = 1) -> TokenBranching:
         arch = self.architecture.generating(self.config.sample, has_depth)

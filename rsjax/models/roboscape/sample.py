@@ -87,6 +87,13 @@ _AXES: dict[str, Any] = {field.name: int(field.name == "cache") for field in fie
 CLIPS: Any = State(**_AXES)
 
 
+def clip_axes(state: State) -> Any:
+    """Returns ``CLIPS``; of a state whose cache is a list of its blocks' parts, clips are the parts' first axis too."""
+    if isinstance(state.cache, list):
+        return replace(CLIPS, cache=0)
+    return CLIPS
+
+
 @struct.dataclass
 class Prompt:
     """Prompt frames encoded by :func:`encode_prompt`, from which any number of rollouts may start."""
@@ -158,13 +165,13 @@ def step(
         The state after the frame, and what the frame is decoded from by branch: tokens (B, S), or mean codes (B, S, D)
         if ``sample.shows_means``.
     """
-    renew: Any = partial(_renew_window, arch, sample, params)
     decode: Any = partial(_decode_frame, arch, sample, params)
     if state.position.ndim > 0:
-        renew = jax.vmap(renew, (CLIPS, 0), CLIPS)
-        decode = jax.vmap(decode, (CLIPS, 0), CLIPS)
+        axes = clip_axes(state)
+        decode = jax.vmap(decode, (axes, 0), axes)
     if beyond and not arch.departures.rotary:
         full = state.position == arch.frames
+        renew: Any = partial(renewed, arch, sample, params)
         state = jax.lax.cond(full.any(), renew, lambda state, full: state, state, full)
     state = decode(state, actions)
     cells = (state.means or state.tokens).items()
@@ -251,10 +258,25 @@ def read_state(arch: Architecture, params: Params, trunk: Float[Array, "B T S C"
     return state_heads.readings(params, trunk[:, -1:])[:, 0]
 
 
+def renewed(arch: Architecture, sample: SampleConfig, params: Params, state: State, full: Bool[Array, "*N"]) -> State:
+    """Returns the state with every full window moved by its stride.
+
+    Args:
+        state: of B clips, or a stack of N states of one clip.
+        full: whether the window is full; of a stack, each window.
+    """
+    renew: Any = partial(_renew_window, arch, sample, params)
+    if state.position.ndim > 0:
+        axes = clip_axes(state)
+        renew = jax.vmap(renew, (axes, 0), axes)
+    moved: State = renew(state, full)
+    return moved
+
+
 def _renew_window(
     arch: Architecture, sample: SampleConfig, params: Params, state: State, full: Bool[Array, ""]
 ) -> State:
-    """Moves a full window by its stride: encodes the frames that stay in it from position 0 on."""
+    """Encodes the frames that stay in a full window from position 0 on."""
     kept = arch.frames - stride(arch, sample)
     newest = slice(-kept, None)
     base = state.actions[:, -kept]

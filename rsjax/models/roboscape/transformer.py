@@ -17,13 +17,13 @@ import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float, Int
 
-from rsjax.layers.attention import KeyValues, attend, packed, put_frames, sees, unpacked
+from rsjax.layers.attention import KeyValues, attend, packed, sees, unpacked
 from rsjax.layers.dense import PRODUCT, Dense, NormParameters, layer_norm
 from rsjax.layers.gelu import gelu
 from rsjax.layers.mlp import feed_forward, mlp
 from rsjax.layers.parameters import Norm
 from rsjax.layers.partition import gathers
-from rsjax.layers.platform import attend_in_clip, attend_over_cache, in_feature_dtype
+from rsjax.layers.platform import attend_in_clip, attend_over_cache, in_feature_dtype, known_after, put_frames
 from rsjax.layers.unstacked_params import together
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.coarse_cells import merged, split, spread
@@ -319,7 +319,7 @@ class Transformer(nn.Module):
         x, new = blocks(cfg, name="blocks")(x, together(cache), start, encoded)
         self.sow("trunk", "rgb", x["rgb"].astype(jnp.float32))  # for run_with_trunk; nothing otherwise
         if cache is not None:
-            cache = put_frames(cache, new, start, departures.rotary)
+            cache = put_frames(cache, new, known_after(x["rgb"], start), departures.rotary)
         return {name: self._head(name, x.get(name, x["rgb"])) for name in cfg.modalities}, cache
 
     def _embed(self, modality: str, table: str, cells: Cells, mask: Bool[Array, "B T S"]) -> Float[Array, "B T s c"]:

@@ -13,6 +13,7 @@ from rsjax.config import SampleConfig, StateHeadsConfig
 from rsjax.data.store import Store, encode_clip, open_store, write_store
 from rsjax.models.base import create_model
 from rsjax.models.branch_states import Decoding
+from rsjax.models.roboscape.imagine import GROUP
 from rsjax.models.roboscape.teacher_forcing import score_tokens
 from rsjax.models.trained import TrainedModel
 from tests.tools.pipeline import toy
@@ -69,6 +70,33 @@ def test_plans_steps_and_branches_read_what_generate_reads(
         [state] = lanes.advance([state], row[None], [Decoding(steps=2)])
         branched.append(state.state)
     np.testing.assert_allclose(np.stack(branched), generated.state, atol=1e-4)
+
+
+def test_clips_of_several_groups_are_those_that_run_alone(
+    model: TrainedModel, clips: Store, actions: np.ndarray
+) -> None:
+    """Also when one of the second group begins again while the others go on."""
+    clip = clips.source("test")[1]
+    first = Video(clip["rgb"][None, :1], clip["depth"][None, :1])
+    count = GROUP + 2
+    together = model.model.imagine(model.params, model.assets, count)
+    rows = actions[1:, None].repeat(count, axis=1)
+    begun = together.restart(np.ones(count, bool), first[np.zeros(count, int)], np.arange(count))
+    made = [begun, together.step(rows[0]), together.step(rows[1])]
+    again = [together.restart(np.arange(count) == GROUP, first, np.array([3])), together.step(rows[0])]
+    for index, numbers in ((1, [1]), (GROUP + 1, [GROUP + 1]), (3, [3, GROUP])):
+        alone = model.model.imagine(model.params, model.assets, 1)
+        wanted: list[Any] = [alone.restart(np.array([True]), first, np.array([index])), alone.step(rows[0, :1])]
+        wanted.append(alone.step(rows[1, :1]))
+        for number in numbers:
+            shown: list[Any] = made
+            place = number
+            if number == GROUP:
+                shown = [again[0][np.zeros(count, int)], again[1]]
+            for frame, expected in zip(shown, wanted, strict=False):
+                np.testing.assert_allclose(frame.rgb[place].astype(int), expected.rgb[0].astype(int), atol=1)
+                np.testing.assert_allclose(frame.state[place], expected.state[0], atol=1e-4)
+                np.testing.assert_allclose(frame.depth[place], expected.depth[0], atol=1e-3)
 
 
 def test_a_branch_has_the_features_that_teacher_forcing_on_its_frames_has(

@@ -102,7 +102,7 @@ def imagined(count: int, pace: float = 1.0, judge: Any = judge, draws: list[list
     noted = [] if draws is None else draws
 
     class Model:
-        def imagine(self, params: Any, assets: Any, count: int) -> ToyImagination:
+        def imagine(self, params: Any, assets: Any, count: int, depth: bool = True) -> ToyImagination:
             return ToyImagination(pace, count, noted)
 
     return ModelWorld(trained_like(Model(), {"pace": pace}), count, judge, action_range(RANGE))

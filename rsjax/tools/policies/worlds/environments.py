@@ -56,6 +56,8 @@ class EnvironmentSettings:
             ``rsjax judge`` trained for the run, if any, or "head" for the model's own success head. Without a
             judge, every reward is 0.
         out_of_range: whether actions outside the action space are clipped and counted ("clip"), or raise ("refuse").
+        depth: whether observations have depth, if the model generates it. Without, a step takes less time and gives
+            the same RGB; the model still reads the first frame's depth.
     """
 
     data_dir: Path | str = "data"
@@ -64,8 +66,11 @@ class EnvironmentSettings:
     max_steps: int = STEPS
     judge: Judge | Path | str | None = "run"
     out_of_range: OutOfRange = "clip"
+    depth: bool = True
 
     def __post_init__(self) -> None:
+        if not isinstance(self.depth, bool):
+            raise UserError(f"depth is {self.depth!r:.80}; it is True or False")
         checked_count("max_steps", self.max_steps, MOST_STEPS)
         check_out_of_range(self.out_of_range)
         checked_path(self.data_dir, "data_dir")
@@ -152,7 +157,7 @@ class _Model:
         actions = action_range(config, normalization)
         self.action_space = spaces.Box(actions.low, actions.high)
         observation: dict[str, spaces.Space[Any]] = {"rgb": spaces.Box(0, 255, (size, size, 3), np.uint8)}
-        if has_depth:
+        if has_depth and settings.depth:
             observation["depth"] = spaces.Box(0.0, max(FAR, depth_range[1]), (size, size))  # type: ignore[index]
         self.observation_space = spaces.Dict(observation)
         self._world: ModelWorld | None = None
@@ -168,7 +173,9 @@ class _Model:
                 judge = head_judge(trained, folder)
             else:
                 judge = judge_of(run if isinstance(run, TrainedModel) else folder, settings.judge, size)
-            self._world = ModelWorld(trained, count, judge, whole_videos=False, imagination=imagination)
+            self._world = ModelWorld(
+                trained, count, judge, whole_videos=False, imagination=imagination, depth=settings.depth
+            )
 
     @property
     def world(self) -> ModelWorld:

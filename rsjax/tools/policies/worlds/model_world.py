@@ -55,6 +55,7 @@ class ModelWorld:
         whole_videos: whether a family that generates only whole videos may serve, one short video for each frame.
         coverage: the bank of training clips from which the distance of episodes is measured; None: it is not.
         imagination: generates the frames of ``count`` clips; by default the model itself.
+        depth: whether frames have depth, if the model generates it.
 
     Raises:
         UserError: the family cannot generate frame by frame, and ``whole_videos`` is False.
@@ -69,7 +70,9 @@ class ModelWorld:
         whole_videos: bool = True,
         coverage: Coverage | None = None,
         imagination: Imagination | None = None,
+        depth: bool = True,
     ) -> None:
+        self._shows_depth = depth
         self.count = count
         self.actions = actions or action_range(trained.config, trained.assets.normalization)
         self.validation: dict[str, Any] | None = getattr(judge, "validation", None)
@@ -83,7 +86,7 @@ class ModelWorld:
         elif whole_videos and type(trained.model).imagine is WorldModel.imagine:
             self._imagination = WholeVideoImagination(trained)
         else:
-            self._imagination = trained.model.imagine(trained.params, trained.assets, count)
+            self._imagination = trained.model.imagine(trained.params, trained.assets, count, depth)
 
     @cached_property
     def key(self) -> str:
@@ -107,7 +110,7 @@ class ModelWorld:
         read = None
         if video.state is not None:
             read = np.repeat(video.state, self._history, axis=1)
-        observation = _last_frame(video)
+        observation = _last_frame(video, self._shows_depth)
         if everything:
             self._recent = recent
             self._read = read
@@ -131,7 +134,7 @@ class ModelWorld:
         self._recent = np.concatenate([self._recent[:, 1:], video.rgb], axis=1)
         if self._read is not None and video.state is not None:
             self._read = np.concatenate([self._read[:, 1:], video.state], axis=1)
-        self._observation = _last_frame(video)
+        self._observation = _last_frame(video, self._shows_depth)
         return self._state(rows, clipped)
 
     def unfamiliarity(self, episodes: Sequence[Episode], frames: int) -> list[float]:
@@ -187,9 +190,9 @@ def checked_verdict(verdict: object, count: int) -> Float[np.ndarray, "B 3"]:
     return numbers
 
 
-def _last_frame(video: Video) -> dict[str, np.ndarray]:
+def _last_frame(video: Video, depth: bool) -> dict[str, np.ndarray]:
     frame = {"rgb": np.asarray(video.rgb)[:, -1]}
-    if video.depth is not None:
+    if depth and video.depth is not None:
         frame["depth"] = np.asarray(video.depth)[:, -1]
     return frame
 

@@ -119,7 +119,7 @@ class Reading:
 
 
 class Imagining:
-    def imagine(self, params: Any, assets: Any, count: int) -> Reading:
+    def imagine(self, params: Any, assets: Any, count: int, depth: bool = True) -> Reading:
         return Reading()
 
 

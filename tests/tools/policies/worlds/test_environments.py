@@ -80,6 +80,19 @@ def test_steps_are_the_frames_of_generate_beyond_the_window(
     assert np.ptp(rgb, axis=0).max() > 50
 
 
+def test_without_depth_the_rgb_is_the_same(env: WorldModelEnv, model: TrainedModel, clips: Store) -> None:
+    plain = WorldModelEnv(model, data_dir=clips.path.parent, judge=None, depth=False)
+    start = {"clip": 1, "draw": 3}
+    rows = actions(3, 28)
+    wanted = [env.reset(options=start)[0], *[env.step(row)[0] for row in rows]]
+    made = [plain.reset(options=start)[0], *[plain.step(row)[0] for row in rows]]
+    for one, other in zip(made, wanted, strict=True):
+        assert plain.observation_space.contains(one)
+        assert list(one) == ["rgb"]
+        # Programs that decode other pictures may differ by float32's last bit, which moves a pixel a level.
+        assert np.abs(one["rgb"].astype(int) - other["rgb"]).max() <= 1
+
+
 def test_a_given_frame_is_the_clips_own(env: WorldModelEnv, clips: Store) -> None:
     clip = clips.source("test")[2]
     held = env.reset(options={"clip": 2, "draw": 5})[0], env.step(np.ones(28))[0]
