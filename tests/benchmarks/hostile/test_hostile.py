@@ -1,5 +1,6 @@
 """The table of hostile inputs: it covers every command, its verdicts are right, and a few of its cases end well."""
 
+import json
 import random
 from pathlib import Path
 
@@ -7,7 +8,7 @@ import pytest
 
 from benchmarks.hostile.__main__ import summary
 from benchmarks.hostile.cases import BAD, GOOD, Case, Ended, Place, verdict
-from benchmarks.hostile.kills import differences
+from benchmarks.hostile.kills import differences, unlabel
 from benchmarks.hostile.options import LINES
 from benchmarks.hostile.table import all_cases
 from rsjax.runtime import HUGE_PAGES
@@ -77,3 +78,14 @@ def test_directories_are_compared_without_measured_times(tmp_path: Path) -> None
         (tmp_path / name / ".lock").write_text(name)
     assert list(differences(tmp_path / "one", tmp_path / "two")) == []
     assert list(differences(tmp_path / "one", tmp_path / "three")) == ["inner/text.md differs"]
+
+
+def test_demonstrations_without_labels_are_a_copy_that_says_nothing_of_success(tmp_path: Path) -> None:
+    manifest = tmp_path / "data" / "lift" / "manifest.json"
+    manifest.parent.mkdir(parents=True)
+    manifest.write_text('{"key": "a", "success_share": 0.0}')
+    for _ in range(2):
+        unlabel(tmp_path)
+        copied = json.loads((tmp_path / "unlabelled" / "lift" / "manifest.json").read_text())
+        assert copied == {"key": "a", "success_share": None}
+    assert json.loads(manifest.read_text())["success_share"] == 0.0
