@@ -62,8 +62,8 @@ class Departures:
     """What the paper does not have. All are off by default; :mod:`rsjax.models.roboscape.departures` implements them.
 
     Others are values of fields that the method has anyway, off by default too: those of sampling in
-    :class:`SampleConfig` (``mean_codes``, ``read_means``, ``guidance``), the keypoint terms in :class:`LossConfig`, and
-    ``model.action_encoder`` "norms".
+    :class:`SampleConfig` (``mean_codes``, ``read_means``, ``guidance``, ``keep_still``), the keypoint terms in
+    :class:`LossConfig`, and ``model.action_encoder`` "norms".
     """
 
     # Input of the network.
@@ -134,6 +134,18 @@ class Departures:
 
 
 @dataclass(frozen=True)
+class KeepStillConfig:
+    """Mixes generated frames with the prompt's last one (:mod:`rsjax.models.roboscape.departures.keep_still`)."""
+
+    noise: float = 10.0  # σ, the error of decoded frames, in grey levels; more keeps more of the prompt
+    blur: float = 0.25  # standard deviation of the Gaussian over changes, in widths of a token
+
+    def __post_init__(self) -> None:
+        require(self.noise > 0, f"model.sample.keep_still.noise is {self.noise}; it must be above 0")
+        require_range(self, "model.sample.keep_still", 0, math.inf, "blur")
+
+
+@dataclass(frozen=True)
 class SampleConfig:
     """Settings of MaskGIT decoding within a frame, and of the memory from frame to frame."""
 
@@ -157,6 +169,7 @@ class SampleConfig:
     window_stride: int = 0
     cache_dtype: Literal["float32", "bfloat16"] = "float32"  # of temporal keys and values; bfloat16 halves the memory
     seed: int = 0  # of the draws; another one gives other videos of the same clips
+    keep_still: KeepStillConfig | None = later(None)  # on for fixed cameras and tokenizers that blur
 
     def __post_init__(self) -> None:
         require(self.steps >= 1, f"model.sample.steps is {self.steps}; a frame needs at least 1 decoding step")

@@ -25,6 +25,7 @@ from rsjax.devices import on_cpu
 from rsjax.models.branch_states import BranchState, Decoding
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.departures import mean_codes
+from rsjax.models.roboscape.departures.keep_still import keep_still
 from rsjax.models.roboscape.sample import State, start, step, with_few_launches
 from rsjax.models.roboscape.transformer import Cache
 from rsjax.tokenizers.codec import Codec
@@ -40,11 +41,13 @@ class _Memory:
         state: of one clip, without its cache.
         cache: None if the clip has its first frame only, or if its window is full and is encoded again anyway.
         sums: of the clip's scaled actions.
+        first: the clip's first frame, recorded and decoded.
     """
 
     state: State
     cache: Cache | None
     sums: Float[np.ndarray, " A"]
+    first: tuple[UInt8[np.ndarray, "H W 3"], UInt8[np.ndarray, "H W 3"]]
 
 
 class TokenBranching:
@@ -84,8 +87,9 @@ class TokenBranching:
         state = replace(self._start(self._sample(Decoding(steps=1)), cells), cache={})
         sums = np.zeros(len(self._codec.normalization.action_mean))
         tokens = {branch: grid.reshape(-1) for branch, grid in grids.items()}
-        memory = _Memory(state, None, sums)
-        return BranchState(self._codec.decode_rgb(grids["rgb"])[0, 0], tokens, None, memory, state=_readings(state))
+        decoded = self._codec.decode_rgb(grids["rgb"])[0, 0]
+        memory = _Memory(state, None, sums, (first.rgb[0, 0], decoded))
+        return BranchState(self._shown(memory, decoded), tokens, None, memory, state=_readings(state))
 
     def advance(
         self, states: Sequence[BranchState], actions: Float[np.ndarray, "N A"], decodings: Sequence[Decoding]
@@ -129,7 +133,10 @@ class TokenBranching:
             np.array([each.guidance for each in chosen], np.float32),
         )
         pictures = np.asarray(rgb)
-        return [self._branch_state(_Memory(new[i], new_caches[i], sums[i]), pictures[i]) for i in range(count)]
+        return [
+            self._branch_state(_Memory(new[i], new_caches[i], sums[i], memories[i].first), pictures[i])
+            for i in range(count)
+        ]
 
     def lightened(self, state: BranchState) -> BranchState:
         """Leaves out the cache if the window is full, as it is then encoded again; otherwise, the whole memory."""
@@ -176,7 +183,17 @@ class TokenBranching:
         size = sum(leaf.nbytes for leaf in jax.tree.leaves(memory.cache))
         without = replace(memory, state=replace(state, entropy=None, features=None))
         features = np.asarray(state.features)[0]
-        return BranchState(rgb, tokens, np.asarray(state.entropy[0]), without, size, means, features, _readings(state))
+        shown = self._shown(memory, rgb)
+        return BranchState(
+            shown, tokens, np.asarray(state.entropy[0]), without, size, means, features, _readings(state)
+        )
+
+    def _shown(self, memory: _Memory, decoded: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
+        """Returns the frame to show."""
+        still = self._config.sample.keep_still
+        if still is None:
+            return decoded
+        return keep_still(still, self._codec.config.downsampling, decoded[None], *memory.first)[0]
 
 
 def _readings(state: State) -> Float[np.ndarray, " K"] | None:

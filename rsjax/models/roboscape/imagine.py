@@ -13,7 +13,7 @@ from typing import Any, cast
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Int, Key, UInt8
 
 from rsjax.clip import Video
 from rsjax.config import SampleConfig, TokenizerConfig, TokenModelConfig
@@ -22,6 +22,7 @@ from rsjax.data.normalization import Normalization, with_sums
 from rsjax.devices import on_cpu
 from rsjax.layers.unstacked_params import apart
 from rsjax.models.roboscape.architecture import Architecture
+from rsjax.models.roboscape.departures.keep_still import keep_still
 from rsjax.models.roboscape.sample import (
     CLIPS,
     State,
@@ -75,6 +76,9 @@ class TokenImagination:
         self._states: list[State | None] = [None] * -(-clips // self._size)
         self._positions = np.zeros(clips, int)  # the next frame's in each window
         self._sums = np.zeros((clips, len(codec.normalization.action_mean)))
+        side = arch.grid * codec.config.downsampling
+        self._first = np.zeros((clips, side, side, 3), np.uint8)  # recorded
+        self._decoded = np.zeros_like(self._first)
 
     def restart(self, which: Bool[np.ndarray, " B"], first: Video, index: Int[np.ndarray, " N"]) -> Video:
         video = first if self._has_depth else Video(first.rgb)
@@ -102,7 +106,9 @@ class TokenImagination:
         self._positions[which] = 1 - int(window_start(self._arch, self._config.sample, 1))
         self._sums[which] = 0
         video = self._codec.decode(grids, np.full(len(first), self._shows_depth))
-        return replace(video, state=self._readings(which))
+        self._first[which] = first.rgb[:, 0]
+        self._decoded[which] = video.rgb[:, 0]
+        return replace(video, rgb=self._shown(video.rgb, which), state=self._readings(which))
 
     def step(self, actions: Float[np.ndarray, "B A"]) -> Video:
         scaled = self._codec.normalization.scaled(actions)
@@ -139,7 +145,17 @@ class TokenImagination:
         depth = None
         if depths:
             depth = np.concatenate(depths)[:count, None]
-        return Video(rgb, depth, state=self._readings(slice(None)))
+        return Video(self._shown(rgb), depth, state=self._readings(slice(None)))
+
+    def _shown(
+        self, decoded: UInt8[np.ndarray, "N 1 H W 3"], which: Any = slice(None)
+    ) -> UInt8[np.ndarray, "N 1 H W 3"]:
+        """Returns the frames to show of these clips."""
+        still = self._config.sample.keep_still
+        if still is None:
+            return decoded
+        token = self._codec.config.downsampling
+        return keep_still(still, token, decoded, self._first[which], self._decoded[which])
 
     def _lanes(self, number: int, count: int) -> Int[np.ndarray, " G"]:
         """Returns the clips of a group; the last clip fills what is left over."""

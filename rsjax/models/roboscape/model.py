@@ -28,6 +28,7 @@ from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.branching import TokenBranching
 from rsjax.models.roboscape.departures import state_heads
 from rsjax.models.roboscape.departures.action_dropout import dropped_actions
+from rsjax.models.roboscape.departures.keep_still import keep_still
 from rsjax.models.roboscape.departures.motion_head import MotionHead
 from rsjax.models.roboscape.departures.self_conditioning import conditions_itself, previous_frames
 from rsjax.models.roboscape.departures.whole_frames import hidden
@@ -169,7 +170,7 @@ class RoboScape(WorldModel[Batch]):
         tokens, inputs = divide((tokens, self._action_inputs(assets, actions)), params)
         key = jax.random.key(sample.seed)
         made = rollout(arch, sample, params, tokens, inputs, key, index=index, no_depth=~has_depth)
-        return self._video(assets, made, has_depth & depth)
+        return self._video(assets, made, has_depth & depth, prompt, tokens)
 
     def plan(
         self,
@@ -199,7 +200,7 @@ class RoboScape(WorldModel[Batch]):
         made = rollout_from(arch, sample, params, encoded, inputs[:, past:], key, same_draws)
         if last is not None:
             made = {branch: grid[:, -last:] for branch, grid in made.items()}
-        return self._video(assets, made, np.repeat(has_depth & depth, candidates))
+        return self._video(assets, made, np.repeat(has_depth & depth, candidates), prompt, tokens)
 
     def imagine(self, params: Params, assets: Assets, clips: int, depth: bool = True) -> TokenImagination:
         return TokenImagination(self.config, self.architecture, self._codec(assets), params, clips, depth)
@@ -240,9 +241,17 @@ class RoboScape(WorldModel[Batch]):
         assert assets.tokenizer is not None
         return Codec(self.tokenizer, assets.tokenizer, assets.normalization)
 
-    def _video(self, assets: Assets, made: Decoded, has_depth: Bool[np.ndarray, " B"]) -> Video:
-        """Returns the video that a rollout makes, with what the state heads read."""
-        video = self._codec(assets).decode(made, has_depth)
+    def _video(
+        self, assets: Assets, made: Decoded, has_depth: Bool[np.ndarray, " B"], prompt: Video, tokens: Tokens
+    ) -> Video:
+        """Returns the video that a rollout from this prompt and its tokens makes, with what the state heads read."""
+        codec = self._codec(assets)
+        video = codec.decode(made, has_depth)
+        still = self.config.sample.keep_still
+        if still is not None:
+            reconstructed = codec.decode_rgb(np.asarray(tokens["rgb"][:, -1]))
+            token = self.tokenizer.downsampling
+            video = replace(video, rgb=keep_still(still, token, video.rgb, prompt.rgb[:, -1], reconstructed))
         if "state" not in made:
             return video
         return replace(video, state=np.asarray(made["state"]))

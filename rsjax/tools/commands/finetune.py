@@ -42,6 +42,9 @@ class Options:
     """Validations in a row without a better one that end a training; a whole training has 8."""
     seed: int = 0
     """Seed of both trainings."""
+    keep_still: Literal["measure", "on", "off"] = "measure"
+    """Keep from a clip's first frame what does not change, which the tokenizer would blur; measure: if less than half
+    of the pixels move in held-out clips. It changes videos, not the training's losses."""
     frames: int = 0
     """Frames of a clip; 0: as many as the model takes, or fewer if episodes are short."""
     rate: float = 0.0

@@ -61,6 +61,8 @@ class Options:
     """Data type of the cache of keys and values."""
     seed: int | None = None
     """Seed of the random draws, 0 to 4294967295."""
+    keep_still: Literal["on", "off"] | None = None
+    """Keep what stands still from the first frame; for fixed cameras."""
 
 
 @main_errors()

@@ -8,7 +8,14 @@ from rsjax.config import Config, content_key
 from rsjax.data.store import Store, open_store
 from rsjax.progress import Progress, note
 from rsjax.tools.finetune.cost import estimate
-from rsjax.tools.finetune.recipe import MARGIN, Finetuning, finetuned, measure_tokenizer
+from rsjax.tools.finetune.recipe import (
+    FIXED_CAMERA,
+    MARGIN,
+    Finetuning,
+    finetuned,
+    measure_tokenizer,
+    moving_share,
+)
 from rsjax.tools.finetune.recordings import Cutting, Recordings, ingest_options
 from rsjax.tools.finetune.start import Source, write_start
 from rsjax.tools.ingest.ingest import count_steps, ingest, list_episodes
@@ -66,7 +73,18 @@ def prepare(source: Source, store: Store, settings: Finetuning, out: Path) -> Co
             adapts = settings.tokenizer == "adapt" or (settings.tokenizer == "measure" and not found.good)
             work.save(weights=weights, adapts=adapts, **asdict(found), said=said(settings, str(found), adapts))
     note(work.metadata["said"])
-    return finetuned(source, store, start, settings, work.metadata["adapts"])
+    share = moving_share(store)
+    still = settings.keep_still == "on" or (settings.keep_still == "measure" and share < FIXED_CAMERA)
+    note(said_of_camera(share, still))
+    return finetuned(source, store, start, settings, work.metadata["adapts"], still)
+
+
+def said_of_camera(share: float, still: bool) -> str:
+    """Returns what was decided on what stands still, and why."""
+    moves = f"{share:.0%} of the pixels have moved by the end of held-out clips"
+    if still:
+        return f"{moves}; videos keep from the first frame what does not change (--keep-still off: they do not)"
+    return f"{moves}; videos keep nothing from the first frame (--keep-still on: what does not change)"
 
 
 def said(settings: Finetuning, found: str, adapts: bool) -> str:

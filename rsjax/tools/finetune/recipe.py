@@ -6,11 +6,21 @@ from typing import Any, Literal
 import numpy as np
 
 from rsjax.clip import Video
-from rsjax.config import Config, CurriculumStageConfig, EarlyStopConfig, RuntimeConfig, TokenModelConfig, require
+from rsjax.config import (
+    Config,
+    CurriculumStageConfig,
+    EarlyStopConfig,
+    KeepStillConfig,
+    RuntimeConfig,
+    TokenModelConfig,
+    require,
+)
+from rsjax.config.fields import later
 from rsjax.data.clips import load_clips
 from rsjax.data.normalization import Normalization
 from rsjax.data.store import Store
 from rsjax.evaluation.metrics.psnr import psnr
+from rsjax.evaluation.metrics.psnr_motion import moved
 from rsjax.models.base import create_autoencoder
 from rsjax.tools.convert import directory as converted
 from rsjax.tools.finetune.start import Source
@@ -19,6 +29,7 @@ from rsjax.tools.pipeline.validation import held_out
 
 MARGIN = 3.0  # dB by which the tokenizer's reconstruction must be better than the first frame repeated, to be kept
 MEASURED_CLIPS = 32
+FIXED_CAMERA = 0.5  # share of the pixels that may move by a clip's end if the camera stands still
 VALIDATIONS = 8  # of each training, at most
 LEAST_BETWEEN = 20  # steps from one to the next, since each generates videos
 EPOCHS = 18  # of the world model
@@ -42,6 +53,8 @@ class Finetuning:
         short_share: share of the world model's steps on the first half of each clip.
         patience: validations without a new best one that end a training; there are eight in a whole training.
         seed: of both trainings.
+        keep_still: whether videos keep what stands still (:class:`rsjax.config.KeepStillConfig`); measure: if the
+            camera stands still (:data:`FIXED_CAMERA`).
     """
 
     steps: int = -1
@@ -52,6 +65,7 @@ class Finetuning:
     short_share: float = 0.0
     patience: int = 3
     seed: int = 0
+    keep_still: Literal["measure", "on", "off"] = later("measure")
 
     def __post_init__(self) -> None:
         require(self.steps >= -1, f"--steps is {self.steps}; give a number, or -1 for as many as suit the clips")
@@ -116,12 +130,21 @@ def measure_tokenizer(source: Source, store: Store) -> Reconstruction:
     return Reconstruction(float(np.mean(psnr(rgb, made))), float(np.mean(psnr(rgb[:, 1:], repeated))))
 
 
-def finetuned(source: Source, store: Store, start: str, settings: Finetuning, adapts: bool) -> Config:
+def moving_share(store: Store) -> float:
+    """Returns the share of the pixels that have moved by the end of held-out clips, as ``psnr_motion`` counts."""
+    clips = load_clips(store, MEASURED_CLIPS, held_out(store))
+    return float(np.mean([moved(rgb)[-1] for rgb in clips.rgb]))
+
+
+def finetuned(
+    source: Source, store: Store, start: str, settings: Finetuning, adapts: bool, still: bool = False
+) -> Config:
     """Returns the configuration of the run.
 
     Args:
         start: the directory of the weights to start from.
         adapts: whether the tokenizer is trained.
+        still: whether videos keep what stands still.
     """
     config = on_store(source.config, store.path)
     model = config.model
@@ -133,7 +156,16 @@ def finetuned(source: Source, store: Store, start: str, settings: Finetuning, ad
     if shifts:
         shifts = max(shifts, COPIES)
     departures = replace(model.departures, self_conditioning_after=after, shifts=shifts)
-    model = replace(model, max_frames=source.architecture.frames, departures=departures, state_heads=None)
+    kept = None
+    if still:
+        kept = KeepStillConfig()
+    model = replace(
+        model,
+        max_frames=source.architecture.frames,
+        departures=departures,
+        state_heads=None,
+        sample=replace(model.sample, keep_still=kept),
+    )
     clips = len(store.source("train"))
     own = config.tokenizer_train
     tokenizer_steps = 0

@@ -13,6 +13,7 @@ from PIL import Image
 
 from rsjax.clip import GENERATED_MARK, Video
 from rsjax.config import Config
+from rsjax.config.config_fields import with_values
 from rsjax.data.clips import Clips
 from rsjax.data.store import Record, Source
 from rsjax.errors import UserError
@@ -210,7 +211,7 @@ def resampled(trained: TrainedModel, sample: dict[str, Any]) -> TrainedModel:
             f"steps is {sample['steps']}, but a frame has {cells} cells, of which each step decodes one at least; take "
             f"at most as many"
         )
-    model = dataclasses.replace(trained.config.model, sample=dataclasses.replace(settings, **sample))  # type: ignore[call-arg]
+    model = dataclasses.replace(trained.config.model, sample=with_values(settings, sample))  # type: ignore[call-arg]
     config = dataclasses.replace(trained.config, model=model)
     return dataclasses.replace(trained, config=config, model=create_model(config))
 

@@ -29,8 +29,9 @@ TINY = KEYPOINTS | {
 def active(model: Any) -> dict[str, Any]:
     """The departures of a model that are on, those of sampling included."""
     assert isinstance(model, TokenModelConfig)
-    off = asdict(Departures()) | {"mean_codes": False, "read_means": False, "guidance": 1.0}
-    sampling = {name: getattr(model.sample, name) for name in ("mean_codes", "read_means", "guidance")}
+    off_sampling = {"mean_codes": False, "read_means": False, "guidance": 1.0, "keep_still": None}
+    off = asdict(Departures()) | off_sampling
+    sampling = {name: getattr(model.sample, name) for name in off_sampling}
     values = asdict(model.departures) | sampling
     return {name: value for name, value in values.items() if value != off[name]}
 

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 import pytest
 
-from rsjax.config import GenieConfig, RoboScapeConfig, to_dict
+from rsjax.config import GenieConfig, KeepStillConfig, RoboScapeConfig, content_key, to_dict
 from rsjax.data.store import open_store
 from rsjax.errors import UserError
 from rsjax.files import write_json
@@ -18,7 +18,7 @@ from rsjax.models.roboscape.transformer import Transformer
 from rsjax.tools.convert import directory
 from rsjax.tools.convert.directory import load_world_model
 from rsjax.tools.finetune.finetune import finetune, make_clips, prepare
-from rsjax.tools.finetune.recipe import Finetuning, Reconstruction
+from rsjax.tools.finetune.recipe import FIXED_CAMERA, Finetuning, Reconstruction, finetuned, moving_share
 from rsjax.tools.finetune.recordings import Cutting, Recordings, find_recordings
 from rsjax.tools.finetune.start import find_source, write_start
 from rsjax.tools.pipeline.run import Run
@@ -112,6 +112,18 @@ def test_public_weights_are_taken_by_path(whole: Run, tmp_path: Path) -> None:
     config = prepare(find_source(public), open_store(whole.clips), SETTINGS, tmp_path / "out")
     assert isinstance(config.model, GenieConfig) and isinstance(cfg.model, RoboScapeConfig)
     assert (config.model.width, config.clips.action_dim) == (cfg.model.width, 6)
+
+
+def test_what_stands_still_is_kept_if_the_camera_does_not_move_or_by_word(whole: Run, model: Path) -> None:
+    store = open_store(whole.clips)
+    assert moving_share(store) > FIXED_CAMERA  # all pixels of noise move
+    assert isinstance(whole.config.model, RoboScapeConfig)
+    assert whole.config.model.sample.keep_still is None
+    source = find_source(model)
+    kept = finetuned(source, store, "", SETTINGS.for_clips(source.config, 2), adapts=True, still=True)
+    assert isinstance(kept.model, RoboScapeConfig)
+    assert kept.model.sample == replace(whole.config.model.sample, keep_still=KeepStillConfig())
+    assert content_key(SETTINGS) != content_key(replace(SETTINGS, keep_still="on"))
 
 
 @pytest.mark.parametrize(("psnr", "kept"), [(30.0, True), (22.0, False), (14.9, False)])
