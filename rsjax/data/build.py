@@ -66,7 +66,9 @@ def write_clips(path: Path | str, clips: Iterable[Mapping[str, Any] | Clip], tes
         writer = ArrayRecordWriter(str(spool), WRITER_OPTIONS)
         count = 0
         for clip in given_clips:
-            given = encode_clip(clip) if isinstance(clip, Clip) else clip
+            given = clip
+            if isinstance(clip, Clip):
+                given = encode_clip(clip)
             if not isinstance(given, Mapping):
                 raise StoreError(f"clip {count}: is a {type(given).__name__}, should be a dict with rgb and actions")
             record = _record(given, f"clip {count}", count)
@@ -96,7 +98,9 @@ def choose_test(names: Collection[str], share: float, seed: int = 0) -> set[str]
     """
     salt = str(seed or "")
     ranked = sorted(names, key=lambda name: hashlib.sha256((name + salt).encode("utf-8", "surrogatepass")).digest())
-    return set(ranked[: min(len(ranked) - 1, max(1, round(share * len(ranked)))) if share > 0 else 0])
+    if share <= 0:
+        return set()
+    return set(ranked[: min(len(ranked) - 1, max(1, round(share * len(ranked))))])
 
 
 def _write(path: Path, spooled: Source, episodes: dict[str, _Episode], share: float, digest: Any, scored: bool) -> None:
@@ -107,16 +111,25 @@ def _write(path: Path, spooled: Source, episodes: dict[str, _Episode], share: fl
         rows = episodes[name].statistics
         total = total.merged(rows) if total and rows else rows
     near_far = [value for name in names["train"] for value in episodes[name].depth]
-    depth_range = [min(near_far), max(near_far)] if near_far else None
-    successes = sum(episode.successes for episode in episodes.values())
+    depth_range = None
+    depth_unit = None
+    if near_far:
+        depth_range = [min(near_far), max(near_far)]
+        depth_unit = "metres"
+    success_share = None
+    if scored:
+        success_share = sum(episode.successes for episode in episodes.values()) / len(spooled)
+    statistics = {}
+    if total is not None:
+        statistics = total.to_json()
     meta = {
         "key": f"{digest.hexdigest()[:12]}-{share}",
         "source": "write_store",
-        **(total.to_json() if total else {}),
+        **statistics,
         "depth_range": depth_range,
-        "depth_unit": "metres" if depth_range else None,
+        "depth_unit": depth_unit,
         "episodes": names,
-        "success_share": successes / len(spooled) if scored else None,
+        "success_share": success_share,
     }
     splits = {
         split: (
@@ -161,7 +174,9 @@ def _record(clip: Mapping[str, Any], where: str, number: int) -> Record:
             f"{where}: row 0 of actions is not zeros; row t is what led from frame t-1 into frame t: {cure}"
         )
     depth = None
+    depth_unit = ""
     if clip.get("depth") is not None:
+        depth_unit = "metres"
         depth = _array(clip, "depth", where, f"metres ({count}, {size}, {size})", np.float32, (count, size, size))
         if depth.min() <= 0:
             raise StoreError(f"{where}: depth is {depth.min():g} somewhere; it is in metres, above 0: fill its holes")
@@ -172,8 +187,9 @@ def _record(clip: Mapping[str, Any], where: str, number: int) -> Record:
         visible = _array(clip, "visible", where, f"bool {tracks.shape[:2]}", np.bool_, tracks.shape[:2])
     origin = {"source": "write_store", "episode": number} | _provenance(clip, where)
     words = {name: _text(clip, name, where) or words_of(origin.get(name)) or UNKNOWN for name in _LABELS}
-    timing = {} if clip.get("fps") is None else {"fps": _rate(clip["fps"], where), "frames": list(range(count))}
-    unit = {"depth_unit": "metres" if depth is not None else ""}
+    timing: dict[str, Any] = {}
+    if clip.get("fps") is not None:
+        timing = {"fps": _rate(clip["fps"], where), "frames": list(range(count))}
     return {
         "rgb": rgb,
         "depth": depth,
@@ -182,7 +198,10 @@ def _record(clip: Mapping[str, Any], where: str, number: int) -> Record:
         "visible": visible,
         "success": _success(clip, where, count),
         "task": _text(clip, "task", where) or UNKNOWN,
-        "provenance": origin | words | timing | unit | {"episode": _name(clip, where) or str(origin["episode"])},
+        "provenance": origin
+        | words
+        | timing
+        | {"depth_unit": depth_unit, "episode": _name(clip, where) or str(origin["episode"])},
     }
 
 
@@ -269,5 +288,7 @@ def _check_alike(shapes: dict[str, tuple[int, ...]], first: dict[str, tuple[int,
     """Checks that a clip's arrays have the first clip's shapes, which ``first`` collects."""
     for name, shape in shapes.items():
         if first.setdefault(name, shape) != shape:
-            hint = f"; without tracks a clip gets {TRACKS} that are never visible" if name == "tracks" else ""
+            hint = ""
+            if name == "tracks":
+                hint = f"; without tracks a clip gets {TRACKS} that are never visible"
             raise StoreError(f"{where}: {name} has the shape {shape}, that of the first clip {first[name]}{hint}")

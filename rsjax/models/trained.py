@@ -58,7 +58,8 @@ class TrainedModel:
         """
         prompt, single = self._prompt(frames, depth, task)
         sequences = self._actions(actions, prompt, () if single else (len(prompt),))
-        video = self.model.generate(self.params, self.assets, prompt, sequences[None] if single else sequences)
+        clips = sequences.reshape(-1, *sequences.shape[-2:])
+        video = self.model.generate(self.params, self.assets, prompt, clips)
         return _first(video) if single else video
 
     def plan(
@@ -119,7 +120,7 @@ class TrainedModel:
             if x.shape != arrays["rgb"].shape:
                 raise ShapeError(f"tokens {name!r} have shape {x.shape}; expected {arrays['rgb'].shape}, that of 'rgb'")
         single = arrays["rgb"].ndim == 3
-        batch: Tokens = {name: x[None] if single else x for name, x in arrays.items()}
+        batch: Tokens = {name: x.reshape(-1, *x.shape[-3:]) for name, x in arrays.items()}
         video = codec.decode(batch, np.full(len(batch["rgb"]), "depth" in batch))
         return _first(video) if single else video
 
@@ -198,8 +199,9 @@ class TrainedModel:
                 f"clip or (B, P, {size}, {size}, 3) for several, uint8, with P and B above 0"
             )
         single = frames.ndim == 4
+        clips = frames.reshape(-1, *frames.shape[-4:])
         if depth is None:
-            return Video(frames[None] if single else frames), single
+            return Video(clips), single
         depth = as_array("depth", depth)
         if depth.shape != frames.shape[:-1] or depth.dtype.kind not in "fiu":
             raise ShapeError(
@@ -208,8 +210,7 @@ class TrainedModel:
             )
         if not is_depth(depth):
             raise ShapeError(f"depth is {_extent(depth)}; expected metres, 0 or more, or NaN where it is unknown")
-        depth = _float32(depth)
-        return (Video(frames[None], depth[None]) if single else Video(frames, depth)), single
+        return Video(clips, _float32(depth).reshape(clips.shape[:-1])), single
 
 
 def is_depth(depth: Float[np.ndarray, "*B H W"]) -> bool:

@@ -80,7 +80,9 @@ def write_videos(
         UserError: the run, its data or a clip is missing, or the actions do not fit.
     """
     trained = load(run)
-    config = relocated(trained.config, store) if store else trained.config
+    config = trained.config
+    if store:
+        config = relocated(config, store)
     source = Run(config, run, data).open_clips().source(request.split)
     clips = chosen_clips(request, source)
     if not FPS[0] <= fps <= FPS[1] or not 1 <= scale <= MOST_SCALE:
@@ -90,16 +92,23 @@ def write_videos(
     foreign = _foreign_actions(request, source, config)
     for number in clips:
         clip = source[number]
-        actions = _lasting(clip["actions"] if foreign is None else foreign, request, config)
+        actions = clip["actions"]
+        name = f"{request.split}_{number:03d}"
+        if foreign is not None:
+            actions = foreign
+            name += "_other_actions"
+        if request.frames is not None:
+            name += f"_{request.frames}_frames"
+        actions = _lasting(actions, request, config)
         prompt = Clips.stacked([clip], [number]).video.frames(0, config.prompt_frames)
         inputs = (trained.params, trained.assets, prompt, actions[None])
         made = trained.model.generate(*inputs, index=np.array([number]))
-        alone = foreign is not None or len(actions) > len(clip["rgb"])
-        name = f"{request.split}_{number:03d}{'' if foreign is None else '_other_actions'}"
-        path = out / f"{name}{'' if request.frames is None else f'_{request.frames}_frames'}.{kind}"
-        frames = made.rgb[0] if alone else _side_by_side(clip, made, number)
+        path = out / f"{name}.{kind}"
         write = write_mp4 if kind == "mp4" else write_gif
-        write(path, frames, fps, scale if alone else 1, GENERATED_MARK)
+        if foreign is not None or len(actions) > len(clip["rgb"]):  # there is no true video to show beside it
+            write(path, made.rgb[0], fps, scale, GENERATED_MARK)
+        else:
+            write(path, _side_by_side(clip, made, number), fps, 1, GENERATED_MARK)
         yield path
 
 
@@ -148,12 +157,13 @@ def chosen_clips(request: Request, source: Source) -> tuple[int, ...]:
     if not len(source):
         raise UserError(f"the {request.split} split has no clips; choose another with --split")
     clips = request.clips or tuple(range(min(4, len(source))))
-    others = () if request.actions_from is None else (request.actions_from,)
-    for flag, numbers in (("--clips", clips), ("--actions-from", others)):
-        for number in numbers:
-            if not 0 <= number < len(source):
-                last = len(source) - 1
-                raise UserError(f"{flag}: no clip {number} in the {request.split} split, which has 0 … {last}")
+    asked = [("--clips", number) for number in clips]
+    if request.actions_from is not None:
+        asked.append(("--actions-from", request.actions_from))
+    for flag, number in asked:
+        if not 0 <= number < len(source):
+            last = len(source) - 1
+            raise UserError(f"{flag}: no clip {number} in the {request.split} split, which has 0 … {last}")
     return clips
 
 
@@ -218,6 +228,8 @@ def resampled(trained: TrainedModel, sample: dict[str, Any]) -> TrainedModel:
 
 def _side_by_side(clip: Record, made: Video, number: int) -> UInt8[np.ndarray, "T H W 3"]:
     shown = len(made.rgb[0])
-    depth = {} if made.depth is None else {"true_depth": clip["depth"][:shown], "predicted_depth": made.depth[0]}
+    depth = {}
+    if made.depth is not None:
+        depth = {"true_depth": clip["depth"][:shown], "predicted_depth": made.depth[0]}
     figure = ClipFigure(title=f"clip {number}", truth=clip["rgb"][:shown], prediction=made.rgb[0], **depth)
     return animation(dataclasses.replace(figure, depth_unit=clip["provenance"].get("depth_unit") or "metres"))

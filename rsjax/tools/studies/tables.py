@@ -100,8 +100,17 @@ def as_csv(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
     return text.getvalue()
 
 
-def mean_text(spread: Spread, decimals: int) -> str:
-    """Returns ``mean ± sample deviation``, or the mean alone for a single value."""
+def number_text(value: float | None, form: str) -> str:
+    """Returns a number in a format such as ``.3f``; "–" for None."""
+    if value is None:
+        return ABSENT
+    return format(value, form)
+
+
+def mean_text(spread: Spread | None, decimals: int) -> str:
+    """Returns ``mean ± sample deviation``, the mean alone for a single value, or "–" for None."""
+    if spread is None:
+        return ABSENT
     if spread.std is None:
         return f"{spread.mean:.{decimals}f}"
     return f"{spread.mean:.{decimals}f} ± {spread.std:.{decimals}f}"

@@ -25,7 +25,7 @@ from rsjax.tools.policies.studies.policy_learning import interval_text, percent
 from rsjax.tools.policies.studies.trials import FPS, Result, Trials, first_frames, try_policy
 from rsjax.tools.policies.worlds.world import FIRST_SEED, World
 from rsjax.tools.studies.report.video import write_mp4
-from rsjax.tools.studies.tables import ABSENT, Table, as_markdown
+from rsjax.tools.studies.tables import ABSENT, Table, as_markdown, number_text
 
 SHARES = (0.01, 0.03, 0.06, 0.12, 0.25, 0.5, 0.75)  # of the training after which policies are saved, before its end
 
@@ -316,12 +316,10 @@ def table(results: Mapping[str, Any]) -> str:
     for row in rows:
         if "pearson" in row:
             numbers = [row[name] for name in NUMBERS]
-            others = [ABSENT if number is None else f"{number:.3f}" for number in numbers]
+            others = [number_text(number, ".3f") for number in numbers]
             shares = [f"{100 * row[name]:.0f} %" for name in ("same_outcome", "uninterpretable")]
             agreements.append([row["run"], *r_text(row["pearson"]), *others, f"{row['bias']:+.3f}", *shares])
-            bias = ABSENT
-            if row["bias_middle"] is not None:
-                bias = f"{row['bias_middle']:+.3f}"
+            bias = number_text(row["bias_middle"], "+.3f")
             middle.append([row["run"], *r_text(row["pearson_inner"]), str(row["inner"]), bias])
     over = [
         [", ".join(each["runs"]), str(each["policies"]), *r_text(each["pearson"]), *r_text(each["pearson_inner"])]

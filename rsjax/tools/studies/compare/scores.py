@@ -4,10 +4,10 @@ Axes: S seeds, B clips.
 """
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -45,12 +45,16 @@ class Entry:
         """Returns each seed's score over all clips; an empty list if any result has no score."""
         values = [result.metrics.get(self.score(metric)) for result in self.group.results]
         known = [float(value) for value in values if value is not None and math.isfinite(value)]
-        return known if len(known) == len(values) else []
+        if len(known) < len(values):
+            return []
+        return known
 
     def per_clip(self, metric: Metric) -> Float[np.ndarray, "S B"] | None:
         """Returns the clips' scores; None if a result has none, or the results' numbers of scores differ."""
         rows = [result.per_clip.get(self.score(metric), []) for result in self.group.results]
-        return np.array(rows) if rows[0] and len({len(row) for row in rows}) == 1 else None
+        if not rows[0] or len({len(row) for row in rows}) > 1:
+            return None
+        return np.array(rows)
 
     def reason(self, metric: Metric) -> str:
         """Returns why there is no score; "" if that is not recorded."""
@@ -98,7 +102,9 @@ def entries_of(groups: Sequence[Group]) -> list[Entry]:
             entry = Entry(name, group, suffix)
             if entry.seeds(psnr) and not any(set(entry.seeds(psnr)) == set(other.seeds(psnr)) for other in found):
                 found.append(entry)
-        entries += found if len(found) == 1 else [replace(each, name=f"{name}, {each.group.name}") for each in found]
+        if len(found) > 1:
+            found = [replace(each, name=f"{name}, {each.group.name}") for each in found]
+        entries += found
     return entries
 
 
@@ -110,7 +116,8 @@ def columns(groups: Sequence[Group], only: Sequence[str] = ()) -> list[Metric]:
     """
     results = [result for group in groups for result in group.results]
     names = dict.fromkeys(name for result in results for name in result.metrics)
-    depth = {f"depth_{each}{_depth_suffix(groups)}" for each in ("absrel", "delta1", "delta2")}
+    suffix = depth_suffix(groups[0].results[0].protocol)
+    depth = {f"depth_{each}{suffix}" for each in ("absrel", "delta1", "delta2")}
     found = [
         replace(each, column=each.column or each.name in depth) for each in metrics().values() if each.name in names
     ]
@@ -127,11 +134,11 @@ def columns(groups: Sequence[Group], only: Sequence[str] = ()) -> list[Metric]:
     return [each for each in found if any(fnmatchcase(each.name, pattern) for pattern in only)]
 
 
-def _depth_suffix(groups: Sequence[Group]) -> str:
-    protocol = groups[0].results[0].protocol
-    alignment = protocol["depth_alignment"]
-    source = protocol["depth_source"]
-    return "" if alignment == "none" else f"_{alignment}_{source}"
+def depth_suffix(protocol: Mapping[str, Any]) -> str:
+    """Returns the end of the names of depth scores under a protocol, such as ``_scale_branch``."""
+    if protocol["depth_alignment"] == "none":
+        return ""
+    return f"_{protocol['depth_alignment']}_{protocol['depth_source']}"
 
 
 def base_of(score: str) -> str:
@@ -148,10 +155,12 @@ def _parts(names: Collection[str]) -> list[Metric]:
         whole = name.rpartition("_")[0]
         bound = part.endswith(("_low", "_high")) and whole in names
         if base and part and not bound and not part.startswith(tuple(BASELINES)):
-            best = part.removeprefix("_best").removesuffix(BEST) if part.endswith(BEST) else ""
-            words = f"best of {best}, prompt included" if best else part[1:].replace("_", " ")
+            best = part.endswith(BEST)
+            words = part[1:].replace("_", " ")
+            if best:
+                words = f"best of {part.removeprefix('_best').removesuffix(BEST)}, prompt included"
             metric = metrics()[base]
-            found.append(replace(metric, name=name, title=f"{metric.title}, {words}", column=bool(best)))
+            found.append(replace(metric, name=name, title=f"{metric.title}, {words}", column=best))
     return found
 
 
@@ -161,7 +170,9 @@ def score_of(entry: Entry, metric: Metric) -> Score:
     clips = entry.per_clip(metric)
     if not seeds:
         return Score(None, None, entry.reason(metric))
-    interval = None if clips is None else paired_bootstrap(clips, 0 * clips[:1], statistic=metric.statistic)
+    interval = None
+    if clips is not None:
+        interval = paired_bootstrap(clips, 0 * clips[:1], statistic=metric.statistic)
     return Score(spread(seeds), interval, "")
 
 
@@ -173,14 +184,21 @@ def difference(entry: Entry, reference: Entry, metric: Metric) -> Difference | N
         return None
     clips = entry.per_clip(metric)
     base = reference.per_clip(metric)
-    paired = clips is not None and base is not None and clips.shape[1] == base.shape[1]
-    interval = paired_bootstrap(clips, base, statistic=metric.statistic) if paired else None  # type: ignore[arg-type]
-    test = None if entry.suffix or reference.suffix else welch(np.array(seeds), np.array(others))
+    interval = None
+    if clips is not None and base is not None and clips.shape[1] == base.shape[1]:
+        interval = paired_bootstrap(clips, base, statistic=metric.statistic)
+    test = None
+    if not entry.suffix and not reference.suffix:
+        test = welch(np.array(seeds), np.array(others))
     return Difference(interval, test, _finding(interval, test, metric))
 
 
 def _finding(interval: Estimate | None, test: TTest | None, metric: Metric) -> Finding:
-    intervals = [each for each in (interval, test.difference if test else None) if each is not None]
+    intervals = []
+    if interval is not None:
+        intervals.append(interval)
+    if test is not None:
+        intervals.append(test.difference)
     if intervals and all(each.value == each.low == each.high == 0 for each in intervals):
         return "same"
     verdicts = {verdict(each, metric.better) for each in intervals}

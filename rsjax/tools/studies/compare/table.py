@@ -17,7 +17,16 @@ from rsjax.tools.studies.compare.published import (
     published_text,
     source_of,
 )
-from rsjax.tools.studies.compare.scores import Difference, Entry, Score, columns, difference, entries_of, score_of
+from rsjax.tools.studies.compare.scores import (
+    Difference,
+    Entry,
+    Score,
+    columns,
+    depth_suffix,
+    difference,
+    entries_of,
+    score_of,
+)
 from rsjax.tools.studies.tables import ABSENT, CellText, Footnotes, Marked, Table, interval_text, mean_text
 
 
@@ -74,7 +83,9 @@ def compare(groups: Sequence[Group], only: Sequence[str] = (), against: str = ""
     require(not against or against in names, f"--against {against}: no such group{did_you_mean(against, names)}")
     entries = entries_of(groups)
     chosen = columns(groups, only)
-    reference = entries[names.index(against) if against else 0]
+    reference = entries[0]
+    if against:
+        reference = entries[names.index(against)]
     protocol = groups[0].results[0].protocol["name"]
     rows = dict.fromkeys(published_name(result.model) for group in groups for result in group.results)
     papers = {name: scores for name in rows if name and (scores := published(name, protocol))}
@@ -95,10 +106,7 @@ def compare(groups: Sequence[Group], only: Sequence[str] = (), against: str = ""
 
 def published_score(comparison: Comparison, metric: Metric, name: str) -> float | None:
     """Returns the score in the published row ``name`` to show next to one of our metrics."""
-    protocol = comparison.protocol
-    plain = protocol["depth_alignment"] == "none"
-    suffix = "" if plain else f"_{protocol['depth_alignment']}_{protocol['depth_source']}"
-    return published_score_of(comparison.papers[name], metric.name, suffix)
+    return published_score_of(comparison.papers[name], metric.name, depth_suffix(comparison.protocol))
 
 
 def score_table(comparison: Comparison, notes: Footnotes) -> Table:
@@ -197,9 +205,13 @@ def _records(comparison: Comparison) -> list[dict[str, Any]]:
         for entry, each, change in zip(comparison.entries, scores, differences, strict=True):
             row: dict[str, Any] = {"metric": metric.name, "entry": entry.name, "reason": each.reason or None}
             row |= {"kind": "baseline" if entry.suffix else "group"}
-            row |= each.spread._asdict() if each.spread else {}
-            row |= {"low": each.interval.low, "high": each.interval.high} if each.interval else {}
-            out.append(row | (_change(change) if change else {}))
+            if each.spread:
+                row |= each.spread._asdict()
+            if each.interval:
+                row |= {"low": each.interval.low, "high": each.interval.high}
+            if change:
+                row |= _change(change)
+            out.append(row)
         for name in comparison.papers:
             if (value := published_score(comparison, metric, name)) is not None:
                 out.append({"metric": metric.name, "entry": name, "kind": "published", "mean": value})

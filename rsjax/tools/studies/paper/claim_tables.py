@@ -10,7 +10,7 @@ from rsjax.tools.studies.ablation.figure import draw
 from rsjax.tools.studies.paper.arm_scores import BASELINES, CEILING, ArmScores
 from rsjax.tools.studies.paper.judge import Judged, Outcome
 from rsjax.tools.studies.report.score_charts import SCENES
-from rsjax.tools.studies.tables import ABSENT, CellText, Marked, Table, mean_text, p_text
+from rsjax.tools.studies.tables import ABSENT, CellText, Marked, Table, mean_text, number_text, p_text
 
 LEGEND = (
     "Differences are of means (or medians) over clips and seeds. The interval is the wider of two: the one from "
@@ -62,7 +62,9 @@ def claim_content(outcome: Outcome) -> dict[str, Any]:
 def caption(outcome: Outcome) -> str:
     """Says what the compared trainings have in common, and what differs between the seeds of an arm."""
     own_clips = any(len(set(arm.clips)) > 1 for arm in outcome.arms)
-    vary = "clips, tokenizer and world model" if own_clips else "the training of the world model alone"
+    vary = "the training of the world model alone"
+    if own_clips:
+        vary = "clips, tokenizer and world model"
     seeds = sorted({len(arm.seeds) for arm in outcome.arms})
     return f"Compared at {EQUAL[outcome.claim.equal]}; {' to '.join(map(str, seeds))} seeds, which vary {vary}."
 
@@ -97,7 +99,7 @@ def claim_tables(claim: Mapping[str, Any]) -> dict[str, Table]:
 
     comparisons: list[list[CellText]] = []
     for each in claim["comparisons"]:
-        metric = f"{each['metric']}, {each['where']}" if each["where"] else each["metric"]
+        metric = ", ".join(filter(None, (each["metric"], each["where"])))
         row = [each["what"], metric, each["sides"] or "", each["difference"], each["interval"], each["p"] or ""]
         row += [each["published"] or "", ", ".join(map(str, each["seeds"])), str(each["clips"])]
         comparisons.append([*row, marked(each["verdict"], each["reason"])])
@@ -118,7 +120,9 @@ def claim_figure(outcome: Outcome, source: str = "") -> bytes | None:
     columns = [column for column in _columns(outcome) if any(column.name in arm.spreads for arm in outcome.arms)]
     names = {column.name for column in columns}
     shown = [arm for arm in outcome.arms if names & set(arm.spreads)]
-    return draw(shown, columns, f"{outcome.claim.place}: {outcome.claim.title}", source) if shown else None
+    if not shown:
+        return None
+    return draw(shown, columns, f"{outcome.claim.place}: {outcome.claim.title}", source)
 
 
 def _columns(outcome: Outcome) -> list[Metric]:
@@ -139,19 +143,17 @@ def _known(names: Sequence[str]) -> list[Metric]:
 def _arm(arm: ArmScores, outcome: Outcome, columns: Sequence[Metric]) -> dict[str, Any]:
     published = outcome.claim.arm(arm.name).published
     spreads = arm.spreads
+    means = {name: spread.mean for name, spread in spreads.items()}
     beside = [CEILING] * bool(columns) + list(outcome.claim.beside)
     return {
         "name": arm.name,
         "absent": arm.absent,
         "seeds": f"{len(arm.seeds)} of {arm.planned}",
         "failed": sum(result.state == "failed" for result in arm.results),
-        "scores": [mean_text(spreads[c.name], c.decimals) if c.name in spreads else ABSENT for c in columns],
-        "published": [
-            f"{published[c.name]:.{c.decimals}f}" if c.name in published else ABSENT
-            for c in _published_columns(outcome)
-        ],
+        "scores": [mean_text(spreads.get(c.name), c.decimals) for c in columns],
+        "published": [number_text(published.get(c.name), f".{c.decimals}f") for c in _published_columns(outcome)],
         "values": {name: spread._asdict() for name, spread in spreads.items()},
-        "beside": [f"{spreads[name].mean:.3g}" if name in spreads else ABSENT for name in beside],
+        "beside": [number_text(means.get(name), ".3g") for name in beside],
         "steps": arm.steps,
         "parameters": arm.parameters,
         "tflop": arm.tflop,
@@ -166,14 +168,15 @@ def _baselines(outcome: Outcome, columns: Sequence[Metric]) -> list[dict[str, An
     if first is None:
         return []
     of = {"_tokenizer": f" of {first.name}"}
+    means = {name: spread.mean for name, spread in first.spreads.items()}
     rows = []
     for suffix in BASELINES:
         names = [f"{column.name}{suffix}" for column in columns]
-        if any(name in first.spreads for name in names):
-            texts = []
-            for name, column in zip(names, columns, strict=True):
-                known = name in first.spreads
-                texts.append(f"{first.spreads[name].mean:.{column.decimals}f}" if known else ABSENT)
+        if any(name in means for name in names):
+            texts = [
+                number_text(means.get(name), f".{column.decimals}f")
+                for name, column in zip(names, columns, strict=True)
+            ]
             rows.append({"name": SCENES[suffix] + of.get(suffix, ""), "scores": texts})
     return rows
 
@@ -184,44 +187,53 @@ def _comparison(judged: Judged) -> dict[str, Any]:
     digits = metric.decimals
     own = compared.score or compared.metric
     other = compared.than_score or compared.metric
-    sides = (compared.better, compared.than) if compared.better != compared.than else (own, other)
+    sides = (compared.better, compared.than)
+    if compared.better == compared.than:
+        sides = (own, other)
+    verdict = MISSING
+    if judged.difference is not None:
+        verdict = verdict_words(judged.verdict, compared.equal_margin, metric.unit)
+    numbers = _numbers(judged)
     return {
         "what": f"{sides[0]} − {sides[1]}",
         "metric": metric.heading,
         "where": compared.measurement,
         "margin": compared.margin,
         "sides": None if judged.sides is None else " / ".join(f"{side:.{digits}f}" for side in judged.sides),
-        "difference": ABSENT if judged.difference is None else f"{judged.difference.value:+.{digits}f}",
+        "difference": number_text(numbers["difference"], f"+.{digits}f"),
         "interval": _interval(judged.difference, digits),
         "p": None if judged.p is None else p_text(judged.p),
         "published": None if judged.published is None else f"{judged.published:+.{digits}f}",
         "seeds": list(judged.seeds),
         "clips": judged.clips,
-        "verdict": verdict_words(judged.verdict, compared.equal_margin, metric.unit) if judged.difference else MISSING,
+        "verdict": verdict,
         "reason": judged.reason,
-        "values": _numbers(judged),
+        "values": numbers,
     }
 
 
 def _numbers(judged: Judged) -> dict[str, Any]:
     """Returns the unrounded numbers of a comparison; the texts of the report are rounded."""
+    numbers: dict[str, Any] = dict.fromkeys(("sides", "difference", "test_low", "test_high", "p_alone"))
+    if judged.sides is not None:
+        numbers["sides"] = list(map(float, judged.sides))
+    if judged.difference is not None:
+        numbers["difference"] = judged.difference.value
+    if judged.test is not None:
+        numbers["test_low"] = judged.test.difference.low
+        numbers["test_high"] = judged.test.difference.high
+        numbers["p_alone"] = judged.test.p_of(judged.shift)
     nothing = Estimate(math.nan, None, None)
     decides = judged.difference or nothing
     resampled = judged.resampled or nothing
     inner = judged.inner or nothing
-    test = judged.test
-    return {
-        "sides": None if judged.sides is None else list(map(float, judged.sides)),
-        "difference": decides.value if judged.difference else None,
+    return numbers | {
         "low": decides.low,
         "high": decides.high,
         "resampled_low": resampled.low,
         "resampled_high": resampled.high,
-        "test_low": test.difference.low if test else None,
-        "test_high": test.difference.high if test else None,
         "low_90": inner.low,
         "high_90": inner.high,
-        "p_alone": test.p_of(judged.shift) if test else None,
         "p": judged.p,
         "equal_margin": judged.comparison.equal_margin,
         "equal_p": judged.equal_p,

@@ -38,8 +38,10 @@ def describe(store: Store, most: int = 200) -> tuple[list[str], list[str]]:
         provenance = record["provenance"]
         lengths[len(record["actions"])] += 1
         tracks.append(motion_of(record))
-        speeds += [provenance["motion"]] if "motion" in provenance else []
-        cameras.update([provenance["camera"]] if "camera" in provenance else [])
+        if "motion" in provenance:
+            speeds.append(provenance["motion"])
+        if "camera" in provenance:
+            cameras[provenance["camera"]] += 1
         rates.update(_rate(provenance))
         actions.append(record["actions"][1:])
         deep += record.get("depth") is not None
@@ -54,15 +56,18 @@ def describe(store: Store, most: int = 200) -> tuple[list[str], list[str]]:
         ("cameras", _counted(cameras)),
     ]
     lines += [("rate", f"{rate} {count}×") for rate, count in rates.items()]
-    lines += [(name, shape) for name, shape in ({} if damaged else store.shapes()).items() if shape != NO_ARRAY]
+    if not damaged:
+        lines += [(name, shape) for name, shape in store.shapes().items() if shape != NO_ARRAY]
+    lines.append(("actions", _ranges(actions)))
+    if len(named) <= MOST_DIMENSIONS:
+        lines += named
     lines += [
-        ("actions", _ranges(actions)),
-        *(named if len(named) <= MOST_DIMENSIONS else ()),
         ("depth", f"in {deep} of {len(tracks)} records read"),
         ("lengths", ", ".join(f"{length} frames {count}×" for length, count in sorted(lengths.items()))),
         ("tracks", histogram(tracks, TRACK_UNIT)),
-        ("motion", histogram(speeds, MOTION_UNIT) if speeds else ""),
     ]
+    if speeds:
+        lines.append(("motion", histogram(speeds, MOTION_UNIT)))
     lines += [(column, _ranked(words)) for column, words in _words(store).items()]
     lines += [("damaged", message) for message in damaged]
     return [f"{name:<9} {text}" for name, text in lines if text], damaged
@@ -84,7 +89,9 @@ def motion_of(record: Record) -> float:
     """Returns the mean distance that tracks move between frames in which they are visible, in % of a side per frame."""
     steps = np.linalg.norm(np.diff(record["tracks"], axis=1), axis=-1)
     seen = record["visible"][:, 1:] & record["visible"][:, :-1]
-    return float(100 * steps[seen].mean()) if seen.any() else 0.0
+    if not seen.any():
+        return 0.0
+    return float(100 * steps[seen].mean())
 
 
 def histogram(values: Sequence[float], unit: str, bins: int = 24) -> str:
@@ -141,7 +148,10 @@ def _rate(provenance: Mapping[str, Any]) -> list[str]:
     step = (frames[-1] - frames[0]) / (len(frames) - 1)
     if times := provenance.get("times"):
         return [f"uneven, about {(len(times) - 1) / (times[-1] - times[0]):.2g} Hz"]
-    return [f"{fps:.4g} fps, every {f'{step:.3g} frames' if step != 1 else 'frame'} ({fps / step:.3g} Hz)"]
+    every = "frame"
+    if step != 1:
+        every = f"{step:.3g} frames"
+    return [f"{fps:.4g} fps, every {every} ({fps / step:.3g} Hz)"]
 
 
 def _dimensions(manifest: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -176,9 +186,10 @@ def _words(store: Store) -> dict[str, Counter[str]]:
 
 def _ranked(words: Counter[str]) -> str:
     more = len(words) - MOST_WORDS
-    return ", ".join(f"{word!r} {count}×" for word, count in words.most_common(MOST_WORDS)) + (
-        f", {more} more" if more > 0 else ""
-    )
+    shown = [f"{word!r} {count}×" for word, count in words.most_common(MOST_WORDS)]
+    if more > 0:
+        shown.append(f"{more} more")
+    return ", ".join(shown)
 
 
 def _counted(numbers: Mapping[str, int]) -> str:

@@ -130,7 +130,7 @@ def write_report(path: Path, report: RunReport) -> None:
         frame_curves=Markup(frame_curves_svg(report.curves, [*scored, *further, *states])),
         notes=notes.texts,
         failures=_failures(report),
-        targets=_targets(report) if report.show_targets else None,
+        targets=_targets(report),
         training={name: Markup(curves_svg(log, name)) for name, log in report.logs.items() if log},
         settings=_settings(report.config),
     )
@@ -217,26 +217,36 @@ def _failures(report: RunReport) -> Markup | None:
         counts = [f"{sum(x > bound for x in values)} of {len(values)}" if values else ABSENT for values in scored]
         if any(scored):
             rows.append([f"{metrics()[name].title}, share above {bound:g}", *counts])
-    return as_html(Table(["clips with", *SCENES.values()], rows)) if rows else None
+    if not rows:
+        return None
+    return as_html(Table(["clips with", *SCENES.values()], rows))
 
 
 def _targets(report: RunReport) -> Markup | None:
-    """Returns the table of the targets whose metrics were measured; None without any."""
+    """Returns the table of the targets whose metrics were measured; None if there are none, or they do not apply."""
+    if not report.show_targets:
+        return None
     rows: list[list[CellText]] = []
     for target, measured, margin in judge(report.metrics):
-        bound = f"{'≥' if target.at_least else '≤'} {target.bound:g} {target.unit}"
+        bound = f"≤ {target.bound:g} {target.unit}"
+        if target.at_least:
+            bound = f"≥ {target.bound:g} {target.unit}"
         if margin >= 0:
             outcome = Marked("met", "met")
         else:
             outcome = Marked(f"missed by {-margin:.2f}", "missed")
         rows.append([target.name, bound, f"{measured:.2f} {target.unit}", outcome])
-    return as_html(Table(["on test episodes", "target", "measured", ""], rows)) if rows else None
+    if not rows:
+        return None
+    return as_html(Table(["on test episodes", "target", "measured", ""], rows))
 
 
 def _settings(config: Mapping[str, Any], name: str = "run") -> dict[str, list[tuple[str, Any]]]:
     """Returns section → (field, value); a nested mapping becomes a section, named by its path."""
     fields = [(key, value) for key, value in config.items() if not isinstance(value, Mapping)]
-    sections = {name: fields} if fields else {}
+    sections = {}
+    if fields:
+        sections[name] = fields
     for key, value in config.items():
         if isinstance(value, Mapping):
             sections |= _settings(value, key if name == "run" else f"{name}.{key}")
