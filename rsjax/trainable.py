@@ -41,6 +41,10 @@ class Trainable(Protocol[B]):
         """The weight λ of each loss term by name."""
         ...
 
+    def __hash__(self) -> int:
+        """Compiled programs are found again by this hash: that of the fields in a frozen dataclass."""
+        return object.__hash__(self)
+
     def init(self, key: Key[Array, ""]) -> Params:
         """Returns fresh parameters."""
         ...

@@ -6,7 +6,7 @@ A state is an ordinary tree of arrays in all three cases, so checkpoints do not 
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from math import prod
 from typing import Any, Literal, TypeVar
 
@@ -30,6 +30,8 @@ Tree = TypeVar("Tree")  # a tree of arrays
 AXIS = "devices"  # of pmap
 DATA = "data"  # axes of the mesh
 SMALL = 2**14  # arrays of fewer elements stay whole, since gathering them costs more than their memory
+
+KEPT = 8  # programs of the last trainings in a process
 
 Kind = Literal["jit", "pmap", "mesh"]
 Step = Callable[[TrainState, PyTree], tuple[TrainState, Metrics]]
@@ -112,14 +114,18 @@ class Sharding:
         if start is not None:
             fresh = jax.jit(lambda: model.init(jax.random.key(loop.seed)), out_shardings=places.params)()
             initial = _place(start(fresh), places.params)
+        return self._make(model, loop)(initial, _place(model.init_extra(), places.extra))
+
+    @lru_cache(maxsize=KEPT)  # noqa: B019 - a sharding is a value
+    def _make(self, model: Trainable[Any], loop: LoopConfig) -> Callable[[Params | None, Extra], TrainState]:
+        """Returns the compiled function from initial parameters (None: fresh ones) and ``extra`` to a state."""
 
         def make(initial: Params | None, extra: Extra) -> TrainState:
             # Arrays from disk are arguments, so that they do not become constants of the compiled program.
             state = create_state(model, loop, None if initial is None else lambda _: initial)
             return state.replace(extra=extra)  # type: ignore[attr-defined]
 
-        extra = _place(model.init_extra(), places.extra)
-        return jax.jit(make, out_shardings=places, donate_argnums=(0, 1))(initial, extra)
+        return jax.jit(make, out_shardings=self._shardings(_shapes(model, loop)), donate_argnums=(0, 1))
 
     def template(self, model: Trainable[Any], loop: LoopConfig) -> TrainState:
         """Returns shapes, dtypes and shardings of :meth:`portable`'s state, to restore a checkpoint."""
@@ -128,8 +134,11 @@ class Sharding:
             lambda x, place: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=place), shapes, self._shardings(shapes)
         )
 
+    @lru_cache(maxsize=KEPT)  # noqa: B019 - a sharding is a value
     def compile(self, train_step: TrainStep, model: Trainable[Any], loop: LoopConfig) -> Step:
         """Returns the compiled ``step(state, batch) -> (state, metrics)``, which donates its state.
+
+        A training that goes on in the same process, or another one with the same settings, compiles nothing again.
 
         Args:
             train_step: :func:`rsjax.training.step.train_step`.
