@@ -103,7 +103,8 @@ def content_key(path: Path) -> str:
 def provenance(runs: Sequence[Run]) -> dict[str, Any]:
     """Returns the commits, machines and dates of the starts of some runs."""
     starts = [start for run in runs for start in read_starts(run.directory)]
-    commits = [f"{s['code']['revision']}{' with changes' * bool(s['code']['dirty'])}" for s in starts]
+    known = [start["code"] for start in starts if start["code"]["revision"]]  # None outside a checkout
+    commits = [f"{code['revision']}{' with changes' * bool(code['dirty'])}" for code in known]
     machines = [f"{s['machine']['cpu_cores']} cores, {s['machine']['device_kind']}" for s in starts]
     days = sorted({start["time"][:10] for start in starts})
     return {
