@@ -79,6 +79,14 @@ def test_two_devices_that_share_a_state_hold_about_half_of_it_each(apart: dict[s
     assert 0.5 < apart["cut"] < 0.6
 
 
+def test_a_training_with_the_same_settings_compiles_nothing_again() -> None:
+    loop = LoopConfig(batch_size=8, sharding="jit")
+    first = Sharding.create(loop).compile(train_step, Regression(), loop)
+    assert Sharding.create(loop).compile(train_step, Regression(), loop) is first
+    other = LoopConfig(batch_size=8, sharding="jit", steps=loop.steps + 1)
+    assert Sharding.create(other).compile(train_step, Regression(), other) is not first
+
+
 @pytest.mark.parametrize(
     ("fields", "local", "processes", "chosen"),
     [

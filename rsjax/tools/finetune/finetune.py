@@ -75,11 +75,11 @@ def prepare(source: Source, store: Store, settings: Finetuning, out: Path) -> Co
     note(work.metadata["said"])
     share = moving_share(store)
     still = settings.keep_still == "on" or (settings.keep_still == "measure" and share < FIXED_CAMERA)
-    note(said_of_camera(share, still))
+    note(camera_note(share, still))
     return finetuned(source, store, start, settings, work.metadata["adapts"], still)
 
 
-def said_of_camera(share: float, still: bool) -> str:
+def camera_note(share: float, still: bool) -> str:
     """Returns what was decided on what stands still, and why."""
     moves = f"{share:.0%} of the pixels have moved by the end of held-out clips"
     if still:
