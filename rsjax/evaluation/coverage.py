@@ -111,10 +111,10 @@ def nearest(
     found = []
     for start in range(0, len(rows), ROWS):
         part = rows[start : start + ROWS].astype(np.float64)
-        apart = np.square(part).sum(1)[:, None] - 2 * part @ bank.T.astype(np.float64) + squares
+        distances = np.square(part).sum(1)[:, None] - 2 * part @ bank.T.astype(np.float64) + squares
         if without is not None:
-            apart[without[start : start + ROWS]] = np.inf
-        least = np.partition(apart, count - 1, axis=1)[:, :count]
+            distances[without[start : start + ROWS]] = np.inf
+        least = np.partition(distances, count - 1, axis=1)[:, :count]
         found.append(np.sqrt(np.maximum(least, 0)).mean(1))
     return np.concatenate(found)
 

@@ -138,8 +138,8 @@ def train_localiser(clips: Sequence[Record], steps: int) -> Localiser:
 def _make_step(optimizer: optax.GradientTransformation) -> Callable[..., tuple[Any, Any]]:
     def loss(params: Any, frames: Array, xy: Array, lifted: Array) -> Array:
         places, logit, log_p = _apply(params, frames)
-        apart = _centres(-(-frames.shape[1] // 2), -(-frames.shape[2] // 2))[:, None] - xy[:, None]  # B n 2 2
-        near = jax.nn.softmax(-jnp.square(apart).sum(-1) / (2 * SPREAD**2), axis=1)
+        offsets = _centres(-(-frames.shape[1] // 2), -(-frames.shape[2] // 2))[:, None] - xy[:, None]  # B n 2 2
+        near = jax.nn.softmax(-jnp.square(offsets).sum(-1) / (2 * SPREAD**2), axis=1)
         # Absolute, not squared, errors: a hidden cube has a large error, which must not dominate the others.
         error = 10 * jnp.abs(places - xy).mean() - 0.3 * (near * log_p).sum(1).mean()
         return error + optax.sigmoid_binary_cross_entropy(logit, lifted).mean()

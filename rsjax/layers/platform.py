@@ -67,7 +67,7 @@ def put_frames(cache: Any, new: Any, start: Any, ring: bool) -> Any:
     """Returns a cache into which new frames from ``start`` on are written; both have a leading axis over blocks.
 
     Args:
-        cache: a tree of :class:`KeyValues`, or :func:`rsjax.layers.unstacked_params.apart` of it.
+        cache: a tree of :class:`KeyValues`, or :func:`rsjax.layers.unstacked_params.unstack_params` of it.
         new: a tree of the same structure with the new frames.
         ring: whether positions beyond the number of slots wrap around.
     """

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 
-def apart(stacks: Any, blocks: int, unroll: int) -> Any:
+def unstack_params(stacks: Any, blocks: int, unroll: int) -> Any:
     """Returns a list of the blocks' parts of a tree of stacks; the tree itself if the scan is not fully unrolled."""
     if unroll < blocks:
         return stacks
@@ -20,8 +20,8 @@ def apart(stacks: Any, blocks: int, unroll: int) -> Any:
     return jax.lax.optimization_barrier([block_part(stacks, i) for i in range(blocks)])
 
 
-def together(parts: Any) -> Any:
-    """Returns the tree of stacks; the inverse of :func:`apart`."""
+def stack_params(parts: Any) -> Any:
+    """Returns the tree of stacks; the inverse of :func:`unstack_params`."""
     return jax.tree.map(lambda *each: jnp.stack(each), *parts) if isinstance(parts, list) else parts
 
 

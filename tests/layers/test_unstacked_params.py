@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from rsjax.config import SampleConfig
-from rsjax.layers.unstacked_params import apart, together
+from rsjax.layers.unstacked_params import stack_params, unstack_params
 from rsjax.models.ivideogpt.rollout import sample
 from rsjax.models.roboscape.sample import encode_prompt, rollout, rollout_from
 from tests.models.ivideogpt import toy
@@ -16,14 +16,14 @@ from tests.models.roboscape.toy_sample import BATCH, DUAL, KEY, given, random_pa
 
 def test_stacking_what_was_taken_apart_changes_nothing() -> None:
     params = random_params(DUAL)
-    parts = apart(params["blocks"], DUAL.blocks, unroll=DUAL.blocks)
+    parts = unstack_params(params["blocks"], DUAL.blocks, unroll=DUAL.blocks)
     assert len(parts) == DUAL.blocks
-    jax.tree.map(np.testing.assert_array_equal, together(parts), params["blocks"])
+    jax.tree.map(np.testing.assert_array_equal, stack_params(parts), params["blocks"])
 
 
 def test_a_scan_that_is_not_fully_unrolled_keeps_its_stacks() -> None:
     params = random_params(DUAL)
-    assert apart(params, DUAL.blocks, DUAL.blocks - 1) is params and together(params) is params
+    assert unstack_params(params, DUAL.blocks, DUAL.blocks - 1) is params and stack_params(params) is params
 
 
 def test_a_rollout_is_the_same() -> None:

@@ -16,7 +16,7 @@ from rsjax.config import ClipShape
 from rsjax.layers.attention import KeyValues, attend_parts, rotate
 from rsjax.layers.dense import Dense
 from rsjax.layers.platform import attend_cells, put_frames
-from rsjax.layers.unstacked_params import together
+from rsjax.layers.unstacked_params import stack_params
 from rsjax.models.ivideogpt.config import IVideoGPTConfig
 from rsjax.models.ivideogpt.sequence import Layout
 from rsjax.trainable import Params
@@ -159,7 +159,7 @@ class LLaMA(nn.Module):
             unroll=min(cfg.unroll, cfg.blocks),
         )
         new: Any
-        x, new = blocks(cfg, name="blocks")(x, (together(cache), jnp.arange(cfg.blocks)), first, keys)
+        x, new = blocks(cfg, name="blocks")(x, (stack_params(cache), jnp.arange(cfg.blocks)), first, keys)
         x = nn.RMSNorm(epsilon=1e-6, name="norm")(x[:, skip:])
         head = Dense(layout.vocabulary, cfg.compute_dtype == "bfloat16", False, NORMAL, name="lm_head")
         if cache is None:

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Int, Key, UInt8
 from rsjax.clip import Video
 from rsjax.devices import divide
 from rsjax.layers.attention import KeyValues
-from rsjax.layers.unstacked_params import apart, together
+from rsjax.layers.unstacked_params import stack_params, unstack_params
 from rsjax.models.ivideogpt.autoencoder import ConditionalCodec
 from rsjax.models.ivideogpt.config import TopKConfig
 from rsjax.models.ivideogpt.llama import Architecture, LLaMA, empty_cache, folded
@@ -97,10 +97,10 @@ def sample(
 
     blocks = arch.config.blocks
     unroll = arch.config.unroll
-    parts = apart(params["blocks"], blocks, unroll)
+    parts = unstack_params(params["blocks"], blocks, unroll)
 
     def forward(cache: KeyValues, tokens: Int[Array, "B K"], first: Array | int) -> tuple[KeyValues, Array]:
-        whole = params | {"blocks": together(parts)}
+        whole = params | {"blocks": stack_params(parts)}
         out: Any = network.apply({"params": whole}, tokens, actions, first, cache, skip=tokens.shape[1] - 1)
         logits, new = out
         return new, logits[:, 0]
@@ -122,7 +122,7 @@ def sample(
         return forward(cache, pair, places[-1]), jnp.concatenate([pair[None, :, 1], drawn, last[None]])
 
     # One more position, because a slot follows the last frame too.
-    cache = apart(empty_cache(arch, clips, end + 1), blocks, unroll)
+    cache = unstack_params(empty_cache(arch, clips, end + 1), blocks, unroll)
     slot = jnp.full((clips, 1), layout.slot, given.dtype)
     start = forward(cache, jnp.concatenate([given, slot], axis=1), 0)
     slots = begin + layout.per_frame * jnp.arange(later)

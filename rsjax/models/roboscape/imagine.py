@@ -20,7 +20,7 @@ from rsjax.config import SampleConfig, TokenizerConfig, TokenModelConfig
 from rsjax.data.depth_color import color_to_depth
 from rsjax.data.normalization import Normalization, with_sums
 from rsjax.devices import on_cpu
-from rsjax.layers.unstacked_params import apart
+from rsjax.layers.unstacked_params import unstack_params
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.departures.keep_still import keep_still
 from rsjax.models.roboscape.sample import (
@@ -187,7 +187,7 @@ def _start(
         return start(arch, sample, params, cells, actions, key[None], hidden)
 
     stacked: State = jax.vmap(start_clip, out_axes=CLIPS)(tokens, keys, no_depth)
-    return replace(stacked, cache=apart(stacked.cache, arch.groups, arch.unroll))
+    return replace(stacked, cache=unstack_params(stacked.cache, arch.groups, arch.unroll))
 
 
 @jax.jit

@@ -28,7 +28,7 @@ from rsjax.clip import Array
 from rsjax.config import SampleConfig
 from rsjax.layers.dense import rounded
 from rsjax.layers.platform import where_launches_take_long
-from rsjax.layers.unstacked_params import apart, together
+from rsjax.layers.unstacked_params import stack_params, unstack_params
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.departures import guidance, mean_codes, state_heads
 from rsjax.models.roboscape.maskgit import Frame, unmask_step
@@ -323,7 +323,7 @@ def apply_network(
     (tokens, mask, actions, no_depth, previous), drop = guidance.doubled(sample, inputs, len(mask))
     shape = (*mask.shape[:2], arch.grid, arch.grid)
     grids = {branch: cells.reshape(*shape, *cells.shape[3:]) for branch, cells in tokens.items()}
-    whole = params | {"blocks": together(params["blocks"])}
+    whole = params | {"blocks": stack_params(params["blocks"])}
     arguments = (grids, mask.reshape(shape), actions, start, cache, drop, no_depth, previous)
     trunk = None
     if arch.state_heads or keep_trunk:
@@ -627,7 +627,7 @@ def _repeat_step(
     past = prompt["rgb"].shape[1]
     beyond = past + actions.shape[1] > arch.frames
     params = for_many_passes(arch, params)
-    state = replace(state, cache=apart(state.cache, arch.groups, arch.unroll))
+    state = replace(state, cache=unstack_params(state.cache, arch.groups, arch.unroll))
     known = mean_codes.codes_of(sample, prompt, arch.code_bits) or prompt
     made = {branch: _with_room(cells, actions.shape[1]) for branch, cells in known.items()}
     made |= _prompt_readings(state, past, actions.shape[1])
@@ -726,7 +726,7 @@ def for_many_passes(arch: Architecture, params: Params) -> Params:
     blocks = params["blocks"]
     if arch.compute_dtype == "bfloat16":
         blocks = rounded(blocks, ADDED_IN_BF16 if arch.feature_dtype == "bfloat16" else ())
-    return params | {"blocks": apart(blocks, arch.groups, arch.unroll)}
+    return params | {"blocks": unstack_params(blocks, arch.groups, arch.unroll)}
 
 
 def _prompt_readings(state: State, past: int, frames: int) -> dict[str, Float[Array, "B T K"]]:

@@ -24,7 +24,7 @@ from rsjax.layers.mlp import feed_forward, mlp
 from rsjax.layers.parameters import Norm
 from rsjax.layers.partition import gathers
 from rsjax.layers.platform import attend_in_clip, attend_over_cache, in_feature_dtype, known_after, put_frames
-from rsjax.layers.unstacked_params import together
+from rsjax.layers.unstacked_params import stack_params
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.coarse_cells import merged, split, spread
 from rsjax.models.roboscape.departures.action_dropout import with_null_action
@@ -316,7 +316,7 @@ class Transformer(nn.Module):
             unroll=min(cfg.unroll, cfg.groups),
         )
         new: Any
-        x, new = blocks(cfg, name="blocks")(x, together(cache), start, encoded)
+        x, new = blocks(cfg, name="blocks")(x, stack_params(cache), start, encoded)
         self.sow("trunk", "rgb", x["rgb"].astype(jnp.float32))  # for run_with_trunk; nothing otherwise
         if cache is not None:
             cache = put_frames(cache, new, known_after(x["rgb"], start), departures.rotary)

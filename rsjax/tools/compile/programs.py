@@ -12,7 +12,7 @@ from jax.sharding import SingleDeviceSharding
 
 from rsjax.config import Config, LoopConfig
 from rsjax.errors import UserError
-from rsjax.layers.unstacked_params import apart
+from rsjax.layers.unstacked_params import unstack_params
 from rsjax.models.base import create_autoencoder, create_model
 from rsjax.models.roboscape.departures import guidance
 from rsjax.models.roboscape.model import RoboScape
@@ -170,7 +170,7 @@ def frame(config: Config, device: Any, clips: int) -> Program:
         tokens = dict.fromkeys(arch.modalities, jnp.zeros((clips, PROMPT_FRAMES, config.grid**2), jnp.int32))
         actions = jnp.zeros((clips, PROMPT_FRAMES, arch.action_inputs))
         state = start(arch, sample, params, tokens, actions, jax.random.split(jax.random.key(0), clips), None)
-        cache = apart(state.cache, arch.groups, arch.unroll)
+        cache = unstack_params(state.cache, arch.groups, arch.unroll)
         return for_many_passes(arch, params), dataclasses.replace(state, cache=cache)
 
     def generate(params: Any, state: Any, actions: Any) -> Any:
