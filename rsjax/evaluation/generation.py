@@ -110,7 +110,7 @@ class Generation:
 
     def _row(self, run: int, kind: str, draw: int) -> Iterator[Batch]:
         count = len(self.clips.rgb)
-        size = batch_size(self.trained)
+        size = batch_size(self.trained, count)
         yield from (Batch(run, kind, draw, start, min(size, count - start)) for start in range(0, count, size))
 
     @cached_property
@@ -147,10 +147,11 @@ class Generation:
             write_file(self.folder / batch.name, encode(record))
 
     def _generate(self, batch: Batch) -> Record:
-        """Generates a batch; the last batch is padded to full size, so that only one program is compiled."""
+        """Generates a batch; the last batch is padded to the others' size, so that only one program is compiled."""
         sampled = batch.kind == SAMPLE
         rows = np.arange(batch.start, batch.start + batch.clips)
-        padded = np.minimum(np.arange(batch.start, batch.start + batch_size(self.trained)), rows[-1])
+        size = batch_size(self.trained, len(self.clips.rgb))
+        padded = np.minimum(np.arange(batch.start, batch.start + size), rows[-1])
         own = self.draws[OWN][0]
         actions = own if sampled else self.draws[batch.kind][batch.draw]
         repetition = batch.run * self.protocol.samples + (batch.draw if sampled else 0)
@@ -164,10 +165,10 @@ class Generation:
         return self.score(rows, video) if sampled else {"rgb": video.rgb, "depth": video.depth, "state": video.state}
 
 
-def batch_size(trained: TrainedModel) -> int:
-    """Returns the clips per batch: the run's number, rounded up to a multiple of the devices of this process."""
+def batch_size(trained: TrainedModel, count: int) -> int:
+    """Returns the clips per batch: the run's number or all ``count``, rounded up to a multiple of the local devices."""
     devices = jax.local_device_count()
-    return -(-trained.config.eval.batch_size // devices) * devices
+    return -(-min(trained.config.eval.batch_size, count) // devices) * devices
 
 
 def teacher_forced(
@@ -180,8 +181,7 @@ def teacher_forced(
     """
     parts = list[TeacherForced]()
     count = len(video)
-    devices = jax.local_device_count()
-    size = min(batch_size(trained), -(-count // devices) * devices)
+    size = batch_size(trained, count)
     for start in range(0, count, size):
         rows = np.minimum(np.arange(start, start + size), count - 1)  # the last batch is padded to full size
         inputs = (trained.params, trained.assets, video[rows], actions[rows])
