@@ -61,7 +61,13 @@ def main_errors() -> Iterator[None]:
             line, status = _answer(error, received)
             if line is None:
                 raise
-            _exit(line, status)
+            print(_readable(line), file=sys.stderr)
+            # At exit, the processes of a distributed run wait for each other. A process that failed would wait in
+            # vain, and jax would then abort with its own status.
+            orderly = (os.EX_TEMPFAIL,) if _has_peers() else (UserError.status,)
+            if status not in orderly:
+                exit_now(status)
+            raise SystemExit(status) from error
 
 
 def _unread() -> bool:
@@ -88,20 +94,15 @@ def _answer(error: BaseException, received: list[int]) -> tuple[str | None, int]
         return f"error: {bad}", 2
     if isinstance(error, UserError):
         return f"error: {error}", error.status
-    cure = _cure(error)
-    return None if cure is None else f"error: {cure}", 2
-
-
-def _cure(error: BaseException) -> str | None:
     where = f" at {error.filename}" if isinstance(error, OSError) and error.filename else ""
     if limit := storage_limit(error):
         cause, _, cure = limit.partition("; ")
-        return f"{cause}{where}; {cure}: the same command resumes"
+        return f"error: {cause}{where}; {cure}: the same command resumes", 2
     if isinstance(error, PermissionError) or getattr(error, "errno", None) == errno.EROFS:
-        return f"no permission to write or read{where}; choose another directory or change its owner"
+        return f"error: no permission to write or read{where}; choose another directory or change its owner", 2
     if where:  # a directory where a file should be, or the reverse, or a path where nothing can be created
-        return f"{error.strerror}{where}; choose another path"  # type: ignore[union-attr,attr-defined]
-    return None
+        return f"error: {error.strerror}{where}; choose another path", 2  # type: ignore[attr-defined]
+    return None, 2
 
 
 def _bad_variable(error: BaseException | None) -> str:
@@ -127,16 +128,6 @@ def _bad_variable(error: BaseException | None) -> str:
 _JAX_REFUSES = re.compile(
     r"^(?:invalid truth value .* for environment '|Invalid value .* for JAX flag )(jax_\w+)", re.I
 )
-
-
-def _exit(line: str, status: int) -> None:
-    print(_readable(line), file=sys.stderr)
-    # At exit, the processes of a distributed run wait for each other. A process that failed would wait in vain, and jax
-    # would then abort with its own status.
-    orderly = (os.EX_TEMPFAIL,) if _has_peers() else (UserError.status,)
-    if status not in orderly:
-        exit_now(status)
-    raise SystemExit(status)
 
 
 def _readable(line: str) -> str:

@@ -161,7 +161,10 @@ def _stop(workers: list[_Worker]) -> None:
 
 def _serve(parent: int, pipe: Connection) -> None:
     """Answers each item with (True, result) or (False, error) until the parent closes the pipe. Runs in a worker."""
-    _end_with(parent)
+    if sys.platform == "linux":  # the kernel kills this process when its parent dies, whatever either is doing
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+    if os.getppid() != parent:  # the parent died before that
+        os._exit(1)
     work = None
     try:
         first_message = pipe.recv_bytes()
@@ -177,14 +180,6 @@ def _serve(parent: int, pipe: Connection) -> None:
             pipe.send(answer)
     except (EOFError, OSError):
         return
-
-
-def _end_with(parent: int) -> None:
-    """Has the kernel kill this process when its parent dies, whatever either is doing."""
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
-    if os.getppid() != parent:  # the parent died before that
-        os._exit(1)
 
 
 class Helper(Generic[Item, Result]):

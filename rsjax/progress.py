@@ -97,7 +97,11 @@ class Progress:
         if now - self._shown < (PLAIN_SECONDS if self._bar is None else TERMINAL_SECONDS):
             return
         self._shown = now
-        parts = self._parts()
+        then, before = self._samples[0]
+        parts = [f"{done}/{self.total} {self.unit}"]
+        if now > then and done > before:
+            rate = (done - before) / (now - then)
+            parts += [*self._rates(rate), f"{duration((self.total - done) / rate)} left"]
         values = [f"{name}={float(value):.4g}" for name, value in scalars.items()]
         line = ", ".join(parts + values)
         if self._bar is None:
@@ -118,15 +122,6 @@ class Progress:
 
     def _print(self, line: str) -> None:
         self._console.print(f"  {self.stage}: {line}", markup=False, highlight=False, soft_wrap=True)
-
-    def _parts(self) -> list[str]:
-        then, before = self._samples[0]
-        now, done = self._samples[-1]
-        parts = [f"{done}/{self.total} {self.unit}"]
-        if now > then and done > before:
-            rate = (done - before) / (now - then)
-            parts += [*self._rates(rate), f"{duration((self.total - done) / rate)} left"]
-        return parts
 
     def _rates(self, per_second: float) -> list[str]:
         rates = [f"{per_second:.3g} {self.unit}/s"]

@@ -31,27 +31,30 @@ def read_curriculum(text: str) -> tuple[CurriculumStageConfig, ...]:
             raise ConfigError(f"curriculum {text:.80}: not JSON ({error}); write a list such as {EXAMPLE}") from error
     else:
         entries = read_json(Path(text), list, cure=f"name a file with a list of stages, such as {EXAMPLE}")
-    return tuple(_stage(number, entry) for number, entry in enumerate(entries, 1))
-
-
-def _stage(number: int, entry: Any) -> CurriculumStageConfig:
-    try:
-        require(isinstance(entry, dict), f"not fields by name but {entry!r:.40}")
-        component = {name: entry[name] for name in entry if name in COMPONENT_FIELDS}
-        stage = {name: entry[name] for name in entry if name not in COMPONENT_FIELDS}
-        if component:
-            require("components" not in stage, f"{', '.join(component)} stand beside components; write them inside")
-            stage["components"] = [component]
-        return from_dict(CurriculumStageConfig, stage)
-    except ConfigError as error:
-        raise ConfigError(f"stage {number} of the curriculum: {error}") from error
+    stages = []
+    for number, entry in enumerate(entries, 1):
+        try:
+            require(isinstance(entry, dict), f"not fields by name but {entry!r:.40}")
+            component = {name: entry[name] for name in entry if name in COMPONENT_FIELDS}
+            stage = {name: entry[name] for name in entry if name not in COMPONENT_FIELDS}
+            if component:
+                require("components" not in stage, f"{', '.join(component)} stand beside components; write them inside")
+                stage["components"] = [component]
+            stages.append(from_dict(CurriculumStageConfig, stage))
+        except ConfigError as error:
+            raise ConfigError(f"stage {number} of the curriculum: {error}") from error
+    return tuple(stages)
 
 
 def write_curriculum(stages: tuple[CurriculumStageConfig, ...]) -> str:
     """Returns the JSON list of these stages, without fields at their defaults, for :func:`read_curriculum`."""
     entries = []
+    default = vars(ComponentConfig())
     for stage in stages:
-        components = [_changed(component) for component in stage.components]
+        components = [
+            {name: value for name, value in vars(component).items() if value != default[name]}
+            for component in stage.components
+        ]
         entry: dict[str, Any] = {"components": components}
         if len(components) == 1:
             entry = components[0]
@@ -62,9 +65,3 @@ def write_curriculum(stages: tuple[CurriculumStageConfig, ...]) -> str:
             entry["frames"] = stage.frames
         entries.append(entry)
     return json.dumps(entries)
-
-
-def _changed(component: ComponentConfig) -> dict[str, Any]:
-    values = {field.name: getattr(component, field.name) for field in dataclasses.fields(ComponentConfig)}
-    default = ComponentConfig()
-    return {name: value for name, value in values.items() if value != getattr(default, name)}

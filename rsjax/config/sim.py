@@ -58,10 +58,6 @@ class SimConfig:
             f"({self.episodes - 1}), so that both splits have clips",
         )
         require_range(self, "sim", 1, math.inf, "control_steps", "image_size", "tracks")
-        self._check_tasks()
-        self._check_recipe()
-
-    def _check_tasks(self) -> None:
         named = {"tasks": self.tasks, "unseen_tasks": self.unseen_tasks}
         for field, tasks in named.items():
             for task in tasks:
@@ -77,14 +73,11 @@ class SimConfig:
         require(
             not both, f"sim.unseen_tasks has {', '.join(both)}, which sim.tasks trains on; a task is seen or unseen"
         )
-
-    def _check_recipe(self) -> None:
         require(bool(self.recipe), f"sim.recipe is empty; name at least one of {', '.join(RECIPES)}")
         for entry in self.recipe:
             name, share = _parted(entry)
-            known = name in RECIPES or name.startswith(RECORDED)
             require(
-                known,
+                name in RECIPES or name.startswith(RECORDED),
                 f"sim.recipe names {name!r}{did_you_mean(name, RECIPES)} (recipes: {', '.join(RECIPES)}, "
                 f"{RECORDED}PATH)",
             )

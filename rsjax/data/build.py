@@ -139,11 +139,12 @@ def _write(path: Path, spooled: Source, episodes: dict[str, _Episode], share: fl
         )
         for split, chosen in names.items()
     }
-    write_store(path, "clips", splits, meta, _labels)
+    write_store(path, "clips", splits, meta, clip_labels)
 
 
-def _labels(record: Record) -> dict[str, str]:
-    return {"task": record["task"]} | {name: record["provenance"][name] for name in _LABELS}
+def clip_labels(record: Record) -> dict[str, str]:
+    """Returns a clip's labels, by which a curriculum or a split can choose it."""
+    return {"task": record["task"]} | {name: record["provenance"][name] or UNKNOWN for name in _LABELS}
 
 
 def _note(episode: _Episode, record: Record, number: int) -> None:

@@ -45,7 +45,12 @@ class LoaderFactory:
 
     def __call__(self, state: dict[str, Any] | None) -> Loader:
         loop = self.loop
-        listed = Quarantine(self.quarantine, _distinct(self.stages), loop.max_damaged)
+        chosen: dict[str, list[np.ndarray]] = {}
+        for part in (part for stage in self.stages for part in stage.components):
+            numbers = np.arange(len(part.source)) if part.chosen is None else part.chosen
+            chosen.setdefault(place_of(part.source, 0)["store"], []).append(numbers)
+        distinct = sum(len(np.unique(np.concatenate(numbers))) for numbers in chosen.values())
+        listed = Quarantine(self.quarantine, distinct, loop.max_damaged)
         return Loader(self.stages, loop.batch_size, loop.seed, listed, workers=loop.workers, state=state)
 
     def replay(self, state: dict[str, Any]) -> Arrays:
@@ -152,7 +157,10 @@ def _resolve(stage: CurriculumStageConfig, batch_size: int, own: Store, transfor
         if not len(component):
             raise StoreError(f"{store.path}: its {SPLIT} split has no records; make it again")
         if config.store:
-            _check_mixable(store, component, own, MixtureComponent(own.source(SPLIT), read))
+            theirs, ours = ({name: one.manifest.get(name) for name in ("kind", "tokenizer")} for one in (store, own))
+            _require_alike(store, own, theirs, ours, needs="records of one kind, made with the same tokenizer")
+            own_shapes = _shapes(MixtureComponent(own.source(SPLIT), read))
+            _require_alike(store, own, _shapes(component), own_shapes, needs="clips of one length and size")
         components.append(component)
     drawn = stage.epochs * sum(map(len, components))
     # Epochs such as 0.1 are not exact in binary, so a value just above a whole number of batches counts as that number.
@@ -178,13 +186,6 @@ def first_frames(transform: Transform, frames: int, record: Record, rng: np.rand
     return transform(cut, rng)
 
 
-def _check_mixable(store: Store, component: MixtureComponent, own: Store, own_component: MixtureComponent) -> None:
-    """Raises :class:`StoreError` if batches cannot contain records of both stores."""
-    theirs, ours = ({name: one.manifest.get(name) for name in ("kind", "tokenizer")} for one in (store, own))
-    _require_alike(store, own, theirs, ours, needs="records of one kind, made with the same tokenizer")
-    _require_alike(store, own, _shapes(component), _shapes(own_component), needs="clips of one length and size")
-
-
 def _require_alike(store: Store, own: Store, theirs: dict[str, Any], ours: dict[str, Any], needs: str) -> None:
     for name in theirs | ours:
         if theirs.get(name) != ours.get(name):
@@ -198,12 +199,3 @@ def _shapes(component: MixtureComponent) -> dict[str, str]:
     _, record = Readable(component, Quarantine(None, len(component.source), 1.0))[0]
     arrays = component.transform(record, np.random.default_rng(0))
     return {name: f"{array.dtype} {array.shape}" for name, array in arrays.items()}
-
-
-def _distinct(stages: tuple[CurriculumStage, ...]) -> int:
-    """Returns the number of records of all stages, each counted once."""
-    chosen: dict[str, list[np.ndarray]] = {}
-    for part in (part for stage in stages for part in stage.components):
-        numbers = np.arange(len(part.source)) if part.chosen is None else part.chosen
-        chosen.setdefault(place_of(part.source, 0)["store"], []).append(numbers)
-    return sum(len(np.unique(np.concatenate(numbers))) for numbers in chosen.values())

@@ -16,7 +16,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Float
 
 from rsjax.clip import Video
 from rsjax.config import EvalConfig
@@ -226,7 +225,13 @@ def plan(trained: TrainedModel, store: Store, eval_clips: EvaluationClips, folde
     clips = eval_clips.clips
     draws = {OWN: clips.actions[None]}
     if protocol.action_draws and trained.config.model.takes_actions:
-        draws |= _random_actions(clips.actions, protocol.action_draws, store)
+        train = store.source("train")
+        recorded = [clip["actions"] for _, clip in readable(train, spread(train, RANGE_CLIPS))]
+        low, high = delta_psnr.action_range(np.stack(recorded))
+        draws |= {
+            "other": clips.actions[delta_psnr.other_clips(len(clips.actions), protocol.action_draws, seed=0)],
+            "uniform": delta_psnr.uniform_actions(clips.actions, low, high, protocol.action_draws, seed=0),
+        }
     if protocol.samples > 1:
         truth = scored_frames(trained, protocol, clips)
     else:
@@ -240,17 +245,6 @@ def plan(trained: TrainedModel, store: Store, eval_clips: EvaluationClips, folde
         lambda rows, video: sample_scores(truth[rows], video, protocol, trained.config.eval),
         folder,
     )
-
-
-def _random_actions(actions: Float[np.ndarray, "B T A"], draws: int, store: Store) -> dict[str, np.ndarray]:
-    """Returns, by kind, actions that are not the clips' own, each (R, B, T, A)."""
-    train = store.source("train")
-    recorded = [clip["actions"] for _, clip in readable(train, spread(train, RANGE_CLIPS))]
-    low, high = delta_psnr.action_range(np.stack(recorded))
-    return {
-        "other": actions[delta_psnr.other_clips(len(actions), draws, seed=0)],
-        "uniform": delta_psnr.uniform_actions(actions, low, high, draws, seed=0),
-    }
 
 
 # What metrics compare: recorded videos with the prediction and both baselines, at the protocol's resolution.

@@ -85,12 +85,13 @@ class Generation:
 
     def videos(self, run: int) -> dict[str, list[Video]]:
         """Returns one repetition's videos by kind: for each draw of actions, the videos of all clips."""
-        return {
-            kind: [
-                _joined([self._video(batch) for batch in self._row(run, kind, draw)]) for draw in range(len(actions))
-            ]
-            for kind, actions in self.draws.items()
-        }
+        videos: dict[str, list[Video]] = {kind: [] for kind in self.draws}
+        for kind, actions in self.draws.items():
+            for draw in range(len(actions)):
+                records = [self._record(batch) for batch in self._row(run, kind, draw)]
+                parts = [Video(record["rgb"], record["depth"], state=record.get("state")) for record in records]
+                videos[kind].append(_joined(parts))
+        return videos
 
     def samples(self, run: int) -> list[dict[str, np.ndarray]]:
         """Returns each further sample's scores of one repetition by name, in the order of the clips."""
@@ -127,10 +128,6 @@ class Generation:
             record = self._generate(batch)
             self._keep(batch, record)
         return record
-
-    def _video(self, batch: Batch) -> Video:
-        record = self._record(batch)
-        return Video(record["rgb"], record["depth"], state=record.get("state"))
 
     def _read(self, batch: Batch) -> Record | None:
         if self.folder is None:
@@ -227,20 +224,16 @@ def with_baselines(trained: TrainedModel, clips: Clips, prediction: Video, promp
     "_repeat_first" repeats the last prompt frame; "_tokenizer" is the reconstruction of the recorded frames, for models
     that have one.
     """
-    shown = {"": prediction, "_repeat_first": _repeat_first(clips.metric_video, prompt_frames)}
+    frames = clips.rgb.shape[1]
+    last = clips.metric_video.frames(prompt_frames - 1, prompt_frames)
+    still = Video(np.repeat(last.rgb, frames, 1))
+    if last.depth is not None:
+        still = replace(still, depth=np.repeat(last.depth, frames, 1))
+    shown = {"": prediction, "_repeat_first": still}
     reconstruction = trained.model.reconstruct(trained.assets, clips.video)
     if reconstruction is not None:
         shown["_tokenizer"] = reconstruction
     return shown
-
-
-def _repeat_first(video: Video, prompt_frames: int) -> Video:
-    """Returns a video that repeats the last prompt frame: the baseline without motion."""
-    last = video.frames(prompt_frames - 1, prompt_frames)
-    frames = video.rgb.shape[1]
-    if last.depth is None:
-        return Video(np.repeat(last.rgb, frames, 1))
-    return Video(np.repeat(last.rgb, frames, 1), np.repeat(last.depth, frames, 1))
 
 
 def _joined(parts: list[Video], axis: int = 0) -> Video:

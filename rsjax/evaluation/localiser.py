@@ -7,7 +7,7 @@ nothing. In training, the true frames are moved and blurred, so that the network
 Axes: B frames, H×W pixels; 2 objects: cube, gripper.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -125,17 +125,7 @@ def train_localiser(clips: Sequence[Record], steps: int) -> Localiser:
     optimizer = optax.adam(optax.cosine_decay_schedule(3e-3, steps))
     state = optimizer.init(params)
     rng = np.random.default_rng(0)
-    step = _make_step(optimizer)
-    with Progress("localiser", steps, "steps") as progress:
-        for number in range(steps):
-            rows: Int[np.ndarray, " B"] = rng.integers(0, len(frames), BATCH)
-            images, places = varied(rng, frames[rows], xy[rows])
-            params, state = step(params, state, images, places, lifted[rows])
-            progress.update(number + 1)
-    return Localiser(params)
 
-
-def _make_step(optimizer: optax.GradientTransformation) -> Callable[..., tuple[Any, Any]]:
     def loss(params: Any, frames: Array, xy: Array, lifted: Array) -> Array:
         places, logit, log_p = _apply(params, frames)
         offsets = _centres(-(-frames.shape[1] // 2), -(-frames.shape[2] // 2))[:, None] - xy[:, None]  # B n 2 2
@@ -149,7 +139,13 @@ def _make_step(optimizer: optax.GradientTransformation) -> Callable[..., tuple[A
         updates, state = optimizer.update(jax.grad(loss)(params, frames, xy, lifted), state)
         return optax.apply_updates(params, updates), state
 
-    return step
+    with Progress("localiser", steps, "steps") as progress:
+        for number in range(steps):
+            rows: Int[np.ndarray, " B"] = rng.integers(0, len(frames), BATCH)
+            images, places = varied(rng, frames[rows], xy[rows])
+            params, state = step(params, state, images, places, lifted[rows])
+            progress.update(number + 1)
+    return Localiser(params)
 
 
 def varied(

@@ -6,8 +6,6 @@ takes 2 to 3 times as long (notebooks/cpu-performance.md). Parameters have the s
 Axes: B images or sequences, C channels, G groups.
 """
 
-from collections.abc import Callable
-
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -35,7 +33,9 @@ class GroupNorm(nn.Module):
     @nn.compact
     def __call__(self, x: Float[Array, "B *cells C"]) -> Float[Array, "B *cells C"]:
         mean = self._of_cells if self.local else self._of_images
-        out = _normed(x.astype(jnp.float32), mean, self.epsilon)
+        wide = x.astype(jnp.float32)
+        centred = wide - mean(wide)
+        out = centred * jax.lax.rsqrt(mean(jnp.square(centred)) + self.epsilon)
         if self.affine:
             scale = self.param("scale", nn.initializers.ones, x.shape[-1:])
             out = out * scale + self.param("bias", nn.initializers.zeros, x.shape[-1:])
@@ -49,8 +49,3 @@ class GroupNorm(nn.Module):
     def _of_images(self, x: Array) -> Array:
         """Returns each image's mean of each group, at every channel of the group."""
         return self._of_cells(jnp.mean(x, tuple(range(1, x.ndim - 1)), keepdims=True))
-
-
-def _normed(x: Array, mean: Callable[[Array], Array], epsilon: float) -> Array:
-    centred = x - mean(x)
-    return centred * jax.lax.rsqrt(mean(jnp.square(centred)) + epsilon)

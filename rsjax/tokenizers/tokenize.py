@@ -94,7 +94,9 @@ def prepare_store(
     out = beside = clips.path.resolve() / FOLDER / tokenizer
     if _is_made(beside, key, clips):
         return _listed(beside, clips, max_damaged, place)
-    if not _writable(beside):
+    parent = next(folder for folder in beside.parents if folder.exists())
+    lock = lock_file(beside)
+    if not os.access(parent, os.W_OK) or (lock.exists() and not os.access(lock, os.W_OK)):  # another user's store
         out = place.resolve() / OWN / tokenizer
     with making(out, wait=True):
         if not _is_made(out, key, clips):
@@ -111,13 +113,6 @@ def _is_made(out: Path, key: str, clips: Store) -> bool:
     missing = manifest.get(_LEFT_OUT, {})
     repaired = (readable(clips.source(split), numbers, lambda _: None) for split, numbers in missing.items())
     return manifest.get("key") == key and not any(next(records, None) for records in repaired)
-
-
-def _writable(out: Path) -> bool:
-    """Returns whether this user may write the set at ``out``; the store may be another user's."""
-    parent = next(folder for folder in out.parents if folder.exists())
-    lock = lock_file(out)
-    return os.access(parent, os.W_OK) and (not lock.exists() or os.access(lock, os.W_OK))
 
 
 def _write(

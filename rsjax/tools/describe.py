@@ -22,6 +22,7 @@ Shapes = dict[str, Any]  # nested, with ShapeDtypeStructs at the leaves
 # The batch size in shapes: a large prime, so that only arrays that grow with the batch have a size divisible by it.
 _CLIPS = 10_007
 CACHE_BYTES = {"float32": 4, "bfloat16": 2}
+PREFIXES = {12: "T", 9: "G", 6: "M", 3: "k", 0: ""}  # by power of ten
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,10 @@ def describe(config: Config) -> Description:
     """Returns shapes and figures of the configuration's world model and tokenizer."""
     modules = {"world_model": by_part(jax.eval_shape(create_model(config).init, jax.random.key(0)))}
     if config.model.uses_tokenizer:
-        modules["tokenizer"] = _tokenizer(config)
+        shapes = jax.eval_shape(create_autoencoder(config).init, jax.random.key(0))
+        if "generator" in shapes:
+            shapes = shapes["generator"] | {"discriminator": shapes["discriminator"]}
+        modules["tokenizer"] = shapes
     return Description(config.name, modules, figures(config, modules))
 
 
@@ -52,22 +56,12 @@ def by_part(world_model: Shapes) -> Shapes:
     """Groups the world model's parameters by part: rgb, depth, projections, shared."""
     parts: dict[str, dict[tuple[str, ...], Any]] = {}
     for path, x in flatten_dict(world_model).items():
-        parts.setdefault(_part(path), {})[path] = x
+        first_words = [name.partition("_")[0] for name in path]
+        part = next((branch for branch in ("rgb", "depth") if branch in first_words), "shared")
+        if "depth_to_rgb" in path:
+            part = "projections"
+        parts.setdefault(part, {})[path] = x
     return {name: unflatten_dict(parts[name]) for name in ("rgb", "depth", "projections", "shared") if name in parts}
-
-
-def _part(path: tuple[str, ...]) -> str:
-    if "depth_to_rgb" in path:
-        return "projections"
-    first_words = [name.partition("_")[0] for name in path]
-    return next((branch for branch in ("rgb", "depth") if branch in first_words), "shared")
-
-
-def _tokenizer(config: Config) -> Shapes:
-    shapes = jax.eval_shape(create_autoencoder(config).init, jax.random.key(0))
-    if "generator" in shapes:
-        return shapes["generator"] | {"discriminator": shapes["discriminator"]}
-    return shapes
 
 
 def figures(config: Config, modules: dict[str, Shapes]) -> dict[str, int]:
@@ -100,8 +94,10 @@ def figures(config: Config, modules: dict[str, Shapes]) -> dict[str, int]:
         numbers |= {"flops_per_frame": flops["forward"] // frames, "flops_train_per_clip": flops["train"]}
     if config.model.uses_tokenizer and (pixels := create_autoencoder(config).flops()):
         numbers |= {"flops_encode_per_image": pixels["encoder"], "flops_decode_per_image": pixels["decoder"]}
+    optimizer = jax.eval_shape(make_optimizer(config.loop("world_model")).init, world)
+    copies = 3 if config.train.ema else 2  # parameters, gradients, averages
     numbers |= {
-        "bytes_train_state": _train_state_bytes(config, world),
+        "bytes_train_state": copies * _bytes(world) + _bytes(optimizer),
         "bytes_activations_per_clip": activations[False],
         "bytes_activations_per_clip_remat": activations[True],
     }
@@ -112,12 +108,6 @@ def figures(config: Config, modules: dict[str, Shapes]) -> dict[str, int]:
 def count(shapes: Shapes) -> int:
     """Returns the number of elements in a tree of arrays or shapes."""
     return sum(x.size for x in jax.tree.leaves(shapes))
-
-
-def _train_state_bytes(config: Config, params: Shapes) -> int:
-    optimizer = jax.eval_shape(make_optimizer(config.loop("world_model")).init, params)
-    copies = 3 if config.train.ema else 2  # parameters, gradients, averages
-    return copies * _bytes(params) + _bytes(optimizer)
 
 
 def activation_bytes(config: Config) -> dict[bool, int]:
@@ -170,7 +160,9 @@ def render(description: Description) -> Group:
     table.add_column("value", justify="right")
     table.add_column("", justify="right")
     for name, value in description.figures.items():
-        table.add_row(_title(name), f"{value:,}", _short(name, value))
+        unit = {"bytes": "B", "flops": "FLOP"}.get(name.partition("_")[0], "")
+        exponent = next((exponent for exponent in PREFIXES if value >= 10**exponent), 0)
+        table.add_row(_title(name), f"{value:,}", f"{value / 10**exponent:.3g} {PREFIXES[exponent]}{unit}")
     return Group(*trees, table, f"On accelerators: rsjax compile {description.name} --target h100x8")
 
 
@@ -185,9 +177,3 @@ def _grow(tree: Tree, shapes: Shapes) -> None:
 
 def _title(name: str) -> str:
     return name.replace("_", " ")
-
-
-def _short(name: str, value: int) -> str:
-    unit = {"bytes": "B", "flops": "FLOP"}.get(name.partition("_")[0], "")
-    size = next((e for e in (12, 9, 6, 3) if value >= 10**e), 0)
-    return f"{value / 10**size:.3g} {dict(zip((12, 9, 6, 3, 0), 'TGMk ', strict=True))[size].strip()}{unit}"

@@ -68,12 +68,6 @@ def _count(environ: Mapping[str, str], name: str) -> int:
     return int(value)
 
 
-def _on_tpu(environ: Mapping[str, str]) -> bool:
-    """Returns whether this may be a machine of a TPU pod, whose peers only Google's metadata server knows."""
-    # jax sets the variable when it is imported on a machine without TPU chips.
-    return "TPU_SKIP_MDS_QUERY" not in environ and importlib.util.find_spec("libtpu") is not None
-
-
 def initialize(coordinator: str = "", processes: int | None = None, process_id: int | None = None) -> None:
     """Joins the processes that were started together. Call it before jax uses a device. One process does nothing.
 
@@ -88,7 +82,10 @@ def initialize(coordinator: str = "", processes: int | None = None, process_id: 
     """
     alone = not coordinator and processes is None and process_id is None
     peers = alone and has_peers(os.environ)
-    if alone and not peers and not _on_tpu(os.environ):
+    # A machine of a TPU pod has peers that only Google's metadata server knows. jax sets the variable when it is
+    # imported on a machine without TPU chips.
+    on_tpu = "TPU_SKIP_MDS_QUERY" not in os.environ and importlib.util.find_spec("libtpu") is not None
+    if alone and not peers and not on_tpu:
         return
     arguments = {} if alone else _address(coordinator, processes, process_id)
     if processes == 1:

@@ -314,7 +314,11 @@ def table(tree: PyTree, parts: int) -> list[Row]:
 
 def shown(rows: list[Row]) -> str:
     """Formats the table: path, shape with the split axis in brackets, and the share of all elements that is split."""
-    lines = [f"{row.path:<72} {_shape(row)}" for row in rows]
+    lines = []
+    for row in rows:
+        cut = len(row.spec) - 1  # a spec ends with the split axis
+        sizes = ", ".join(f"[{size}]" if axis == cut else str(size) for axis, size in enumerate(row.shape))
+        lines.append(f"{row.path:<72} ({sizes})")
     total = sum(prod(row.shape) for row in rows)
     return "\n".join([*lines, f"{total:,} elements, {cut_elements(rows) / total:.1%} of them cut"])
 
@@ -332,8 +336,3 @@ def shardings(tree: PyTree, mesh: Mesh) -> PyTree:
 
 def _path(keys: KeyPath) -> str:
     return jax.tree_util.keystr(keys, simple=True, separator="/")
-
-
-def _shape(row: Row) -> str:
-    cut = len(row.spec) - 1  # a spec ends with the split axis
-    return f"({', '.join(f'[{size}]' if axis == cut else str(size) for axis, size in enumerate(row.shape))})"

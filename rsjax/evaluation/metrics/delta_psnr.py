@@ -90,15 +90,12 @@ def other_clips(clips: int, draws: int, seed: int) -> Int[np.ndarray, "R B"]:
     if clips < 2:
         raise ValueError(f"another clip's actions need at least 2 clips to evaluate, not {clips}; raise eval.clips")
     rng = np.random.default_rng(seed)
-    return np.stack([_derangement(clips, rng) for _ in range(draws)])
-
-
-def _derangement(n: int, rng: np.random.Generator) -> Int[np.ndarray, " n"]:
-    """Draws a permutation without fixed points uniformly, by rejection; it takes about e tries for any n."""
-    while True:
-        permutation = rng.permutation(n)
-        if (permutation != np.arange(n)).all():
-            return permutation
+    permutations: list[Int[np.ndarray, " B"]] = []
+    while len(permutations) < draws:  # by rejection, which takes about e tries for any number of clips
+        permutation = rng.permutation(clips)
+        if (permutation != np.arange(clips)).all():
+            permutations.append(permutation)
+    return np.stack(permutations)
 
 
 _register("delta_psnr", "ΔPSNR, another clip's actions", "other")

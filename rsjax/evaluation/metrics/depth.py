@@ -146,28 +146,24 @@ def _exact_scores(scene: Scene) -> dict[str, DepthScores]:
 
 
 def _scores(scene: Scene, alignment: Alignment, source: DepthSource) -> DepthScores:
-    truth, predicted = _branch_depth(scene) if source == "branch" else _estimated_depth(scene)
+    if source == "branch":
+        rows = scene.truth.has_depth
+        if scene.truth.depth is None or not rows.any():
+            raise Unavailable("no test clip has depth in metres")
+        if scene.prediction.depth is None:
+            raise Unavailable("the model generates no depth")
+        truth = scene.truth.depth[rows]
+        predicted = scene.prediction.depth[rows]
+    else:
+        if scene.estimated is None:
+            raise Unavailable(_NO_ESTIMATOR)
+        truth = scene.estimated.truth
+        predicted = scene.estimated.prediction
     first = scene.prompt_frames
     try:
         return depth_scores(truth[:, first:], predicted[:, first:], alignment)
     except ValueError as error:
         raise Unavailable(str(error)) from error
-
-
-def _branch_depth(scene: Scene) -> tuple[Depths, Depths]:
-    """Returns the recorded and the generated depth of the clips that have recorded depth."""
-    rows = scene.truth.has_depth
-    if scene.truth.depth is None or not rows.any():
-        raise Unavailable("no test clip has depth in metres")
-    if scene.prediction.depth is None:
-        raise Unavailable("the model generates no depth")
-    return scene.truth.depth[rows], scene.prediction.depth[rows]
-
-
-def _estimated_depth(scene: Scene) -> tuple[Depths, Depths]:
-    if scene.estimated is None:
-        raise Unavailable(_NO_ESTIMATOR)
-    return scene.estimated.truth, scene.estimated.prediction
 
 
 def abs_rel(truth: Float[np.ndarray, "..."], prediction: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
@@ -206,15 +202,11 @@ def align(
             disparity = scale / np.maximum(full, _MIN_PREDICTION) + shift
             return 1 / np.maximum(disparity, 1e-3)
         case "l1_scale":
-            return full * _l1_scale(d, p)
-
-
-def _l1_scale(d: Float[np.ndarray, " N"], p: Float[np.ndarray, " N"]) -> float:
-    scale = d.mean() / p.mean()
-    for _ in range(_L1_STEPS):
-        weight = 1 / (np.abs(scale * p - d) + 1e-8)
-        scale = (weight * p * d).sum() / (weight * p * p).sum()
-    return max(float(scale), _MIN_L1_SCALE)
+            scale = d.mean() / p.mean()
+            for _ in range(_L1_STEPS):
+                weight = 1 / (np.abs(scale * p - d) + 1e-8)
+                scale = (weight * p * d).sum() / (weight * p * p).sum()
+            return full * max(float(scale), _MIN_L1_SCALE)
 
 
 def depth_scores(

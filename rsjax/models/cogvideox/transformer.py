@@ -176,7 +176,8 @@ class Transformer(nn.Module):
         if arch.texts:
             shape = (arch.texts, cfg.text.tokens, cfg.text.width)
             text = self.param("task_tokens", nn.initializers.normal(1.0), shape)[text]
-        x = jnp.concatenate([self._text(text), self._video(latents, image)], axis=1)
+        text = nn.Dense(cfg.width, kernel_init=XAVIER, name="text_proj")(text)
+        x = jnp.concatenate([text, self._video(latents, image)], axis=1)
         if cfg.positions == "sincos":
             x = x + fixed_positions(arch)
         if cfg.learned_positions:
@@ -198,10 +199,10 @@ class Transformer(nn.Module):
         ada = nn.Dense(2 * cfg.width, kernel_init=ZEROS, name="norm_out_linear")(nn.silu(time))[:, None]
         shift, scale = jnp.split(ada, 2, axis=-1)
         x = _norm("norm_out")(x) * (1 + scale) + shift
-        return self._unpatchify(nn.Dense(cfg.patch_size**2 * arch.channels, kernel_init=ZEROS, name="proj_out")(x))
-
-    def _text(self, text: Float[Array, "B n w"]) -> Tokens:
-        return nn.Dense(self.arch.model.width, kernel_init=XAVIER, name="text_proj")(text)
+        x = nn.Dense(cfg.patch_size**2 * arch.channels, kernel_init=ZEROS, name="proj_out")(x)
+        x = x.reshape(len(x), arch.frames, *arch.grid, arch.channels, cfg.patch_size, cfg.patch_size)
+        x = x.transpose(0, 1, 2, 5, 3, 6, 4)
+        return x.reshape(len(x), arch.frames, arch.rows, arch.columns, arch.channels)
 
     def _video(self, latents: Float[Array, "B F h w C"], image: Float[Array, "B h w C"] | None) -> Tokens:
         cfg = self.arch.model
@@ -213,12 +214,6 @@ class Transformer(nn.Module):
         patch = (cfg.patch_size, cfg.patch_size)
         x = nn.Conv(cfg.width, patch, patch, "VALID", kernel_init=XAVIER, name="patches")(latents)
         return x.reshape(len(x), -1, cfg.width)
-
-    def _unpatchify(self, x: Float[Array, "B S out"]) -> Float[Array, "B F h w C"]:
-        arch = self.arch
-        p = self.arch.model.patch_size
-        x = x.reshape(len(x), arch.frames, *arch.grid, arch.channels, p, p).transpose(0, 1, 2, 5, 3, 6, 4)
-        return x.reshape(len(x), arch.frames, arch.rows, arch.columns, arch.channels)
 
     def init_params(self, key: Key[Array, ""]) -> Params:
         """Returns initial parameters, with which the network predicts zeros."""

@@ -49,7 +49,12 @@ def sampler_coefficients(noise: NoiseConfig, sample: DenoiseConfig) -> SamplerCo
     """Returns the sampler's table."""
     if sample.sampler == "pndm":
         return _pndm(noise, sample)
-    return _ddim(noise, sample)
+    t = timesteps(noise, sample)[::-1]
+    keep, add = _moves(noise, sample, t, t - noise.steps // sample.steps)
+    ones = np.ones(len(t))
+    zeros = np.zeros(len(t))
+    only_this = np.tile([1.0, 0.0, 0.0, 0.0], (len(t), 1))
+    return SamplerCoefficients(t, keep, add, ones, zeros, only_this, zeros, zeros)
 
 
 def timesteps(noise: NoiseConfig, sample: DenoiseConfig) -> Int[np.ndarray, " steps"]:
@@ -61,15 +66,6 @@ def timesteps(noise: NoiseConfig, sample: DenoiseConfig) -> Int[np.ndarray, " st
     if sample.spacing == "leading":
         return np.arange(count, dtype=np.int32) * (every // count)
     return (np.round(np.arange(every, 0, -every / count))[:count].astype(np.int32) - 1)[::-1]
-
-
-def _ddim(noise: NoiseConfig, sample: DenoiseConfig) -> SamplerCoefficients:
-    t = timesteps(noise, sample)[::-1]
-    keep, add = _moves(noise, sample, t, t - noise.steps // sample.steps)
-    ones = np.ones(len(t))
-    zeros = np.zeros(len(t))
-    only_this = np.tile([1.0, 0.0, 0.0, 0.0], (len(t), 1))
-    return SamplerCoefficients(t, keep, add, ones, zeros, only_this, zeros, zeros)
 
 
 def _pndm(noise: NoiseConfig, sample: DenoiseConfig) -> SamplerCoefficients:

@@ -96,18 +96,14 @@ class DiTBlock(nn.Module):
         ada = nn.Dense(6 * cfg.width, kernel_init=ZEROS, name="ada")(nn.silu(condition))
         shift_a, scale_a, gate_a, shift_m, scale_m, gate_m = jnp.split(ada, 6, axis=-1)
         qkv = dense(3 * cfg.width, name="qkv")(modulate(x, shift_a, scale_a))
-        x = x + gate_a * dense(cfg.width, name="proj")(self._attend(qkv))
-        hidden = dense(cfg.mlp_ratio * cfg.width, name="fc1")(modulate(x, shift_m, scale_m))
-        return x + gate_m * dense(cfg.width, name="fc2")(nn.gelu(hidden, approximate=True))
-
-    def _attend(self, qkv: Float[Array, "B T S D3"]) -> Tokens:
-        cfg = self.config
-        q, k, v = (x.reshape(*x.shape[:-1], cfg.heads, -1) for x in jnp.split(qkv, 3, axis=-1))
+        q, k, v = (y.reshape(*y.shape[:-1], cfg.heads, -1) for y in jnp.split(qkv, 3, axis=-1))
         if self.over_time:
             out = attend(q.swapaxes(1, 2), k.swapaxes(1, 2), v.swapaxes(1, 2), None).swapaxes(1, 2)
         else:
             out = attend_cells(q, k, v, cfg.compute_dtype == "bfloat16")
-        return out.reshape(*out.shape[:-2], cfg.width)
+        x = x + gate_a * dense(cfg.width, name="proj")(out.reshape(x.shape))
+        hidden = dense(cfg.mlp_ratio * cfg.width, name="fc1")(modulate(x, shift_m, scale_m))
+        return x + gate_m * dense(cfg.width, name="fc2")(nn.gelu(hidden, approximate=True))
 
 
 class Pair(nn.Module):
@@ -174,7 +170,7 @@ class DiT(nn.Module):
             unroll=min(cfg.unroll, pairs),
         )
         x, _ = scan(cfg, name="blocks")(x, (acted, plain), jnp.arange(pairs) == 0)
-        return self._unpatchify(self._final(x, last))[..., : cfg.inputs]
+        return self._final(x, last)[..., : cfg.inputs]
 
     def _action(self, actions: Float[Array, "B T A"], drop: Bool[Array, " B"] | None) -> Float[Array, "B t D"]:
         """Returns the embedding of the actions: one for each frame, or one for all."""
@@ -197,17 +193,13 @@ class DiT(nn.Module):
             return x
         return jnp.where(drop[:, None, None], unknown, x)
 
-    def _final(self, x: Tokens, condition: Condition) -> Float[Array, "B T S out"]:
-        cfg = self.config
-        ada = nn.Dense(2 * cfg.width, kernel_init=ZEROS, name="final_ada")(nn.silu(condition))
-        shift, scale = jnp.split(ada, 2, axis=-1)
-        return nn.Dense(cfg.patch_size**2 * cfg.outputs, kernel_init=ZEROS, name="final")(modulate(x, shift, scale))
-
-    def _unpatchify(self, x: Float[Array, "B T S out"]) -> Float[Array, "B T h w outputs"]:
+    def _final(self, x: Tokens, condition: Condition) -> Float[Array, "B T h w outputs"]:
         cfg = self.config
         p = cfg.patch_size
-        rows, columns = cfg.grid
-        x = x.reshape(*x.shape[:2], rows, columns, p, p, cfg.outputs).swapaxes(3, 4)
+        ada = nn.Dense(2 * cfg.width, kernel_init=ZEROS, name="final_ada")(nn.silu(condition))
+        shift, scale = jnp.split(ada, 2, axis=-1)
+        x = nn.Dense(p**2 * cfg.outputs, kernel_init=ZEROS, name="final")(modulate(x, shift, scale))
+        x = x.reshape(*x.shape[:2], *cfg.grid, p, p, cfg.outputs).swapaxes(3, 4)
         return x.reshape(*x.shape[:2], cfg.rows, cfg.columns, cfg.outputs)
 
     def init_params(self, key: Key[Array, ""]) -> Params:

@@ -9,7 +9,6 @@ from typing import TypeVar
 
 import jax.numpy as jnp
 from flax.traverse_util import flatten_dict, unflatten_dict
-from jaxtyping import Array, Float
 
 from rsjax.config import Config, ConfigError, from_dict
 from rsjax.config.fields import differences
@@ -96,16 +95,11 @@ def completed(fresh: Params, saved: Params, arch: Architecture) -> Params:
         z = arch.channels
         there["patches/kernel"] = jnp.zeros(own["patches/kernel"].shape).at[:, :, :z].set(there["patches/kernel"])
         for name in ("final/kernel", "final/bias"):
-            there[name] = _with_depth(there[name], arch)
+            lead = there[name].shape[:-1]  # the last axis: a patch's cells, then their channels
+            noise = there[name].reshape(*lead, arch.patch_size**2, -1)[..., :z]
+            empty = jnp.zeros((*lead, arch.patch_size**2, arch.outputs))
+            there[name] = empty.at[..., :z].set(noise).reshape(*lead, -1)
     return unflatten_dict(there, sep="/")
-
-
-def _with_depth(last: Float[Array, "*D out"], arch: Architecture) -> Float[Array, "*D out2"]:
-    """Returns weights of the last layer with zeros for the channels of depth: a patch's cells, then their channels."""
-    lead = last.shape[:-1]
-    noise = last.reshape(*lead, arch.patch_size**2, -1)[..., : arch.channels]
-    empty = jnp.zeros((*lead, arch.patch_size**2, arch.outputs))
-    return empty.at[..., : arch.channels].set(noise).reshape(*lead, -1)
 
 
 def _section(directory: Path, name: str, kind: type[C], stage: Part, command: str) -> C | Config:

@@ -118,7 +118,12 @@ class TokenBranching:
             if cache is None or lane >= count:  # a pass uses up its caches, so that none can be in two lanes
                 cache = self._start(sample, {name: cells[:, -1:] for name, cells in memory.state.tokens.items()}).cache
             caches.append(cache)
-        clips = [replace(memory.state, means=_means(self._arch, sample, memory.state)) for memory in memories]
+        clips = []
+        for state in (memory.state for memory in memories):
+            means = mean_codes.codes_of(sample, state.tokens, self._arch.code_bits)
+            if means and state.means:  # frames that have no mean codes get their tokens' codes
+                means = state.means
+            clips.append(replace(state, means=means))
         new, new_caches, rgb = _advance(
             self._arch,
             sample,
@@ -208,14 +213,6 @@ def program_clips(lanes: int) -> int:
     if on_cpu():
         return 1
     return lanes
-
-
-def _means(arch: Architecture, sample: SampleConfig, state: State) -> mean_codes.Means:
-    """Returns a state's mean codes if the settings show them; frames that have none get their tokens' codes."""
-    codes = mean_codes.codes_of(sample, state.tokens, arch.code_bits)
-    if codes and state.means:
-        return state.means
-    return codes
 
 
 _start = jax.jit(start, static_argnums=(0, 1))

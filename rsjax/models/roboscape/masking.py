@@ -68,7 +68,11 @@ def corrupt(
             for branch_key, branch in zip(branch_keys, clip, strict=True):
                 noisy[branch] = _replace_sub_tokens(branch_key, clip[branch], rates, code_bits, vocabularies)
         first = after_prefix(visible_prefix, mask_key, frames, first_masked)
-        return Masked(noisy, _mask(mask_key, next(iter(clip.values())).shape, first))
+        rate_key, cell_key = jax.random.split(mask_key)
+        rate = jnp.cos(jnp.pi / 2 * jax.random.uniform(rate_key, (frames,)))
+        rate = jnp.where(jnp.arange(frames) >= first, rate, 0.0)
+        drawn = jax.random.uniform(cell_key, next(iter(clip.values())).shape)
+        return Masked(noisy, drawn < rate[:, None, None])
 
     return jax.vmap(one_clip)(index, tokens)
 
@@ -93,11 +97,3 @@ def _replace_sub_tokens(key: Array, tokens: Array, rate: Array, code_bits: int, 
     random = jax.random.randint(code_key, sub_tokens.shape, 0, 2 ** (code_bits // vocabularies), sub_tokens.dtype)
     where = jax.random.uniform(where_key, sub_tokens.shape) < rate[:, None, None, None]
     return lfq.merge_tokens(jnp.where(where, random, sub_tokens), code_bits)
-
-
-def _mask(key: Array, shape: tuple[int, ...], first_masked: Array) -> Array:
-    rate_key, cell_key = jax.random.split(key)
-    frames = shape[0]
-    rate = jnp.cos(jnp.pi / 2 * jax.random.uniform(rate_key, (frames,)))
-    rate = jnp.where(jnp.arange(frames) >= first_masked, rate, 0.0)
-    return jax.random.uniform(cell_key, shape) < rate[:, None, None]

@@ -85,7 +85,14 @@ def roofline(config: Config, batch: int, ceiling: float, budget: float) -> dict[
     numbers: dict[str, Any] = {"roofline_bandwidth_bytes_per_s": speed} | _rows("roofline", step)
     for half, products in tokenizer_operations(config.tokenizer, config.clips.image_size).items():
         numbers |= _rows(f"roofline_{half}", {each.name: measure(each, gradient=False) for each in products})
-    return numbers | _row("roofline_cached_pass", *_cached_pass(model, batch, ceiling, speed, budget))
+    # A cached pass reads parameters and cache once.
+    params = jax.jit(model.init)(jax.random.key(0))
+    cache = full_cache(model, batch)
+    run = jax.jit(cached_pass(model, batch))
+    seconds = median_seconds(lambda: run(params, cache), budget)
+    read = sum(x.nbytes for x in jax.tree.leaves((params, cache)))
+    least = max(pass_flops(model.architecture, cache) / ceiling, read / speed)
+    return numbers | _row("roofline_cached_pass", seconds, least)
 
 
 def _row(name: str, seconds: float, least: float) -> dict[str, float]:
@@ -241,16 +248,6 @@ def pass_flops(arch: Architecture, cache: StackedCache) -> int:
     """Returns the floating-point operations of a pass over one frame that attends to the cache and to itself."""
     _, clips, _, _, slots, _ = cache["rgb"].k.shape
     return clips * forward_flops(arch, slots + 1) // (slots + 1)
-
-
-def _cached_pass(model: RoboScape, batch: int, ceiling: float, speed: float, budget: float) -> tuple[float, float]:
-    """Returns seconds and least seconds of a cached pass, which reads parameters and cache once."""
-    params = jax.jit(model.init)(jax.random.key(0))
-    cache = full_cache(model, batch)
-    run = jax.jit(cached_pass(model, batch))
-    seconds = median_seconds(lambda: run(params, cache), budget)
-    read = sum(x.nbytes for x in jax.tree.leaves((params, cache)))
-    return seconds, max(pass_flops(model.architecture, cache) / ceiling, read / speed)
 
 
 def _causal(frames: int, q: Any, k: Any, v: Any) -> Any:

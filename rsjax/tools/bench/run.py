@@ -162,7 +162,10 @@ def facts(config: Config, batch: int) -> dict[str, Any]:
     device = jax.local_devices()[0]
     name = device.device_kind
     if device.platform == "cpu":
-        name = _cpu_model()
+        info = Path("/proc/cpuinfo")
+        lines = info.read_text().splitlines() if info.exists() else []
+        names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+        name = names[0] if names else platform.processor() or platform.machine()
     model = config_fields(config.model)
     return {
         "preset": config.name,
@@ -177,13 +180,6 @@ def facts(config: Config, batch: int) -> dict[str, Any]:
         "xla_flags": os.environ.get("XLA_FLAGS", ""),
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
     }
-
-
-def _cpu_model() -> str:
-    info = Path("/proc/cpuinfo")
-    lines = info.read_text().splitlines() if info.exists() else []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor() or platform.machine()
 
 
 def table(numbers: dict[str, Any]) -> Table:

@@ -182,20 +182,20 @@ def bits(dtype: str) -> int:
 
 def arrays(text: str) -> tuple[Array, ...]:
     """Parses the arrays of a shape; a tuple's are flat."""
-    return tuple(_array(found) for found in _ARRAY.finditer(_COMMENT.sub("", text)))
-
-
-def _array(found: re.Match[str]) -> Array:
-    layout = found[4] or ""
-    tile = re.search(r"T\(([\d,]*)\)", layout)
-    space = re.search(r"S\((\d+)\)", layout)
-    return Array(
-        dtype=found[1],
-        dims=_numbers(found[2]),
-        order=_numbers(found[3]),
-        tile=_numbers(tile and tile[1]),
-        space=sum(_numbers(space and space[1])),
-    )
+    parsed = []
+    for found in _ARRAY.finditer(_COMMENT.sub("", text)):
+        layout = found[4] or ""
+        tile = re.search(r"T\(([\d,]*)\)", layout)
+        space = re.search(r"S\((\d+)\)", layout)
+        array = Array(
+            dtype=found[1],
+            dims=_numbers(found[2]),
+            order=_numbers(found[3]),
+            tile=_numbers(tile and tile[1]),
+            space=sum(_numbers(space and space[1])),
+        )
+        parsed.append(array)
+    return tuple(parsed)
 
 
 def _numbers(text: str | None) -> tuple[int, ...]:

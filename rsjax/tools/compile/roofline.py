@@ -213,7 +213,9 @@ class _Counter:
 
     def _run(self, one: Instruction, computation: Computation, times: int) -> list[Kernel]:
         """Returns the kernels of an instruction."""
-        if one.opcode in FREE or (one.opcode == "custom-call" and _target(one) in FREE_CALLS) or self._scalar(one):
+        # A TPU's scalar unit computes what has no axes.
+        scalar = self.card.platform == "tpu" and one.opcode != "fusion" and all(not x.dims for x in one.arrays)
+        if one.opcode in FREE or (one.opcode == "custom-call" and _target(one) in FREE_CALLS) or scalar:
             return []
         if one.opcode == "while":
             return self.kernels(self.module[one.called[0]], times * self._trips(one))
@@ -224,17 +226,14 @@ class _Counter:
             return [kernel for name in one.called for kernel in self.kernels(self.module[name], times)]
         return [replace(self._kernel(one, computation), launches=times)]
 
-    def _scalar(self, one: Instruction) -> bool:
-        """Returns whether a TPU's scalar unit computes the instruction."""
-        return self.card.platform == "tpu" and one.opcode != "fusion" and all(not x.dims for x in one.arrays)
-
     def _trips(self, loop: Instruction) -> int:
         """Returns the iterations of a loop: those that XLA found, or the constant in its condition."""
         known = re.search(r'known_trip_count"?:\s*\{"?n"?:\s*"?(\d+)', loop.attributes)
         if known:
             return int(known[1])
         condition = self.module[loop.attribute("condition").lstrip("%")]
-        limits = [int(one.argument) for one in self._inside(condition) if _is_integer(one)]
+        constants = [one for one in self._inside(condition) if one.opcode == "constant" and one.argument.isdigit()]
+        limits = [int(one.argument) for one in constants if one.arrays[0].dtype in ("s32", "u32", "s64")]
         if len(limits) == 1:
             return limits[0]
         self.warnings.append(f"{loop.name}: a loop of an unknown number of iterations, counted once")
@@ -509,7 +508,3 @@ def _source(inner: Computation, value: Instruction) -> Instruction:
 
 def _target(one: Instruction) -> str:
     return one.attribute("custom_call_target").strip('"')
-
-
-def _is_integer(one: Instruction) -> bool:
-    return one.opcode == "constant" and one.arrays[0].dtype in ("s32", "u32", "s64") and one.argument.isdigit()

@@ -67,7 +67,8 @@ def read_network(source: Path, holders: Sequence[str] = HOLDERS) -> TensorFile:
     """
     if source.name.endswith(INDEX):
         index = read_json(source, cure="put the published one beside the weights").get("weight_map")
-        if not isinstance(index, dict) or not index or not all(_is_name(file) for file in index.values()):
+        files = index.values() if isinstance(index, dict) else ()
+        if not files or not all(isinstance(file, str) and Path(file).name == file for file in files):
             raise ConvertError(f"{source}: has no weight_map from tensors to files beside it; restore it")
         merged = _merged([source.with_name(name) for name in sorted(set(index.values()))], holders)
         known = {merged.names[own]: own for own in merged.tensors}
@@ -82,10 +83,6 @@ def read_network(source: Path, holders: Sequence[str] = HOLDERS) -> TensorFile:
         names = [f"{match[1]}-{number:05d}-of-{last}{match[4]}" for number in range(1, int(last) + 1)]
         return _merged([source.with_name(name) for name in names], holders)
     return read_tensors(source, holders)
-
-
-def _is_name(value: object) -> bool:
-    return isinstance(value, str) and Path(value).name == value
 
 
 def _merged(paths: Sequence[Path], holders: Sequence[str]) -> TensorFile:

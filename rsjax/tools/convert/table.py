@@ -77,7 +77,12 @@ def public_shapes(table: Table, shapes: Any) -> dict[str, Shape]:
         ConvertError: the network and the table do not have the same parameters.
     """
     flat = flatten_dict(shapes, sep="/")
-    _check_complete(table, {path: leaf.shape for path, leaf in flat.items()})
+    stacked = {entry.path for entry in table if entry.layer is not None}
+    slots = [(path, i) for path, x in flat.items() for i in (range(x.shape[0]) if path in stacked else (None,))]
+    known = [(entry.path, entry.layer) for entry in table]
+    if sorted(slots, key=repr) != sorted(known, key=repr):
+        names = {path for path, _ in set(slots) ^ set(known)}
+        raise ConvertError(f"the public format has no name for these parts of the network: {_some(names)}")
     public: dict[str, Shape] = {}
     for entry in table:
         if entry.layer is None:
@@ -167,15 +172,6 @@ def _is_float(x: np.ndarray) -> bool:
 def _is_finite(x: np.ndarray) -> bool:
     with np.errstate(over="ignore"):
         return bool(np.isfinite(x.astype(np.float32)).all())
-
-
-def _check_complete(table: Table, shapes: dict[str, Shape]) -> None:
-    stacked = {entry.path for entry in table if entry.layer is not None}
-    slots = [(p, i) for p, s in shapes.items() for i in (range(s[0]) if p in stacked else (None,))]
-    known = [(entry.path, entry.layer) for entry in table]
-    if sorted(slots, key=repr) != sorted(known, key=repr):
-        names = {path for path, _ in set(slots) ^ set(known)}
-        raise ConvertError(f"the public format has no name for these parts of the network: {_some(names)}")
 
 
 def _some(names: Iterable[str]) -> str:

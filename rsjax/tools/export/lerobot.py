@@ -199,7 +199,10 @@ def _layout(store: Store, clip: Record, root: Path, options: LeRobotOptions) -> 
         )
     fps = float(video_rate(fps))  # timestamps have to be those of the frames, even in a long video of many episodes
     width = clip["actions"].shape[1]
-    names = _names(store, width)
+    names = [f"action_{number}" for number in range(width)]
+    steps = width // len(CONTROLS)
+    if store.manifest.get("source", "").startswith("robosuite/") and width == steps * len(CONTROLS):
+        names = [f"{name}_{step}" for step in range(steps) for name in CONTROLS]  # of simulated Lift
     columns: dict[str, Sequence[str]] = {}
     if options.state == "zeros":
         columns[STATE] = ZEROS
@@ -213,14 +216,6 @@ def _layout(store: Store, clip: Record, root: Path, options: LeRobotOptions) -> 
 
 def _camera(clip: Record) -> str:
     return "".join(c if c.isalnum() else "_" for c in str(clip["provenance"].get("camera") or "image"))
-
-
-def _names(store: Store, width: int) -> list[str]:
-    """Returns a name for each dimension of the actions; an action of simulated Lift is a sequence of controls."""
-    steps = width // len(CONTROLS)
-    if store.manifest.get("source", "").startswith("robosuite/") and width == steps * len(CONTROLS):
-        return [f"{name}_{step}" for step in range(steps) for name in CONTROLS]
-    return [f"action_{number}" for number in range(width)]
 
 
 def _episode(clip: Record, layout: LayoutV30 | LayoutV21) -> LeRobotEpisode:

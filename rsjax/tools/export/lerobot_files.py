@@ -172,18 +172,19 @@ def _stats(rows: Num[np.ndarray, "N D"], count: int) -> dict[str, np.ndarray]:
 
 def merged_stats(one: Stats, other: Stats) -> Stats:
     """Returns the statistics of both together; quantiles become weighted means, as in LeRobot's own aggregation."""
-    if one:
-        return {name: _merged(one[name], other[name]) for name in one}
-    return other
-
-
-def _merged(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    count = one["count"] + other["count"]
-    share = float(other["count"][0] / count[0])
-    mixed = {name: (1 - share) * one[name] + share * other[name] for name in ("mean", *QUANTILES)}
-    spread = [stats["std"] ** 2 + (stats["mean"] - mixed["mean"]) ** 2 for stats in (one, other)]
-    ends = {"min": np.minimum(one["min"], other["min"]), "max": np.maximum(one["max"], other["max"])}
-    return mixed | ends | {"std": np.sqrt((1 - share) * spread[0] + share * spread[1]), "count": count}
+    if not one:
+        return other
+    merged: Stats = {}
+    for feature, first in one.items():
+        second = other[feature]
+        count = first["count"] + second["count"]
+        share = float(second["count"][0] / count[0])
+        mixed = {name: (1 - share) * first[name] + share * second[name] for name in ("mean", *QUANTILES)}
+        spread = [stats["std"] ** 2 + (stats["mean"] - mixed["mean"]) ** 2 for stats in (first, second)]
+        ends = {"min": np.minimum(first["min"], second["min"]), "max": np.maximum(first["max"], second["max"])}
+        std = np.sqrt((1 - share) * spread[0] + share * spread[1])
+        merged[feature] = mixed | ends | {"std": std, "count": count}
+    return merged
 
 
 def plain_stats(stats: Stats, quantiles: bool = True) -> dict[str, Any]:

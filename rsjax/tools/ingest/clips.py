@@ -17,7 +17,6 @@ from jaxtyping import Float, Int
 
 from rsjax.clip import UNKNOWN
 from rsjax.config import ConfigError, content_key, require, to_dict
-from rsjax.data.codec import Record
 from rsjax.data.normalization import Statistics
 from rsjax.tools.ingest.actions import (
     ActionConfig,
@@ -249,12 +248,6 @@ def _words(
     return {"task": task or UNKNOWN, "provenance": provenance}
 
 
-def clip_labels(record: Record) -> dict[str, str]:
-    """Returns a clip's labels, by which a curriculum or a split can choose it."""
-    columns = ("difficulty", "scene", "segment", "skill")
-    return {"task": record["task"]} | {name: record["provenance"][name] or UNKNOWN for name in columns}
-
-
 def _tracks(
     stored: FrameRecords | None, frames: Int[np.ndarray, " T"], count: int, placement: Placement | None
 ) -> Tracked | None:
@@ -314,13 +307,11 @@ class _Fitted:
         if missing:
             new = self._read(missing)
         kept = {frame: picture for frame, picture in self._kept.items() if frame >= frames[0]}
-        sized = (self._fitted(picture) for picture in new)
-        self._kept = kept | dict(zip(missing, sized, strict=True))
-        return np.stack([self._kept[frame] for frame in frames])
-
-    def _fitted(self, picture: np.ndarray) -> np.ndarray:
         leading = self._pictures or self  # not an attribute: a reference to itself would keep its pictures in memory
-        if leading.placement is None:
-            height, width = picture.shape[:2]
-            leading.placement = Placement.create(self._config.fit, height, width, self._config.image_size)
-        return leading.placement.picture(picture)
+        for frame, picture in zip(missing, new, strict=True):
+            if leading.placement is None:
+                height, width = picture.shape[:2]
+                leading.placement = Placement.create(self._config.fit, height, width, self._config.image_size)
+            kept[frame] = leading.placement.picture(picture)
+        self._kept = kept
+        return np.stack([self._kept[frame] for frame in frames])

@@ -120,7 +120,11 @@ Checked = tuple[EpisodeRef, list[Finding], EpisodeStats | None, str]  # the last
 
 def check_episode(episode: Episode, limits: Thresholds) -> tuple[list[Finding], EpisodeStats]:
     """Returns all problems found in one episode by itself, and its statistics."""
-    problems = [*_time(episode, limits.gap), *_actions(episode), *_flips(episode), *_segments(episode)]
+    problems = [*_time(episode, limits.gap), *_actions(episode), *_flips(episode)]
+    for part in episode.segments:
+        if not 0 <= part.start < part.end <= len(episode.timestamps):
+            extent = f"from {part.start} to {part.end} of {len(episode.timestamps)} frames"
+            problems.append(("segment", f"{part.text!r} goes {extent}"))
     first: UInt8[np.ndarray, "H W 3"] | None = None
     for name, frames in episode.cameras.items():
         more, picture = _pictures(name, frames, limits.frames, moving=bool(episode.actions[1:].any()))
@@ -183,12 +187,6 @@ def _flips(episode: Episode) -> Iterator[Problem]:
             if (flips := np.flatnonzero((part[1:] * part[:-1]).sum(1) < 0)).size:
                 where = f"frame {flips[0] + 1 + offset} ({len(flips)} such)"
                 yield "quaternion-flip", f"{name}: dimensions {first} to {first + 3} at {where}"
-
-
-def _segments(episode: Episode) -> Iterator[Problem]:
-    for part in episode.segments:
-        if not 0 <= part.start < part.end <= len(episode.timestamps):
-            yield "segment", f"{part.text!r} goes from {part.start} to {part.end} of {len(episode.timestamps)} frames"
 
 
 def quaternions(rows: Float[np.ndarray, "N n"]) -> list[int]:

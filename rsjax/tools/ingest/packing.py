@@ -6,11 +6,11 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from rsjax.data.build import choose_test
+from rsjax.data.build import choose_test, clip_labels
 from rsjax.data.codec import Record
 from rsjax.data.normalization import Statistics
 from rsjax.data.store import StoreError, open_store, write_store
-from rsjax.tools.ingest.clips import CLIPS, clip_labels
+from rsjax.tools.ingest.clips import CLIPS
 from rsjax.tools.ingest.episode import EpisodeRef
 from rsjax.tools.ingest.summary import IngestSummary
 from rsjax.tools.ingest.work_items import EpisodeWork, IngestPlan, SplitShares

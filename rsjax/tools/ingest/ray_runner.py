@@ -54,30 +54,26 @@ def run_on_ray(
         raise RayError("--runner ray needs Ray: pip install -e '.[ray]'") from error
     here = not ray.is_initialized()
     if here:
-        _connect(ray, plan, address, cpus)
+        options: dict[str, Any] = {"log_to_driver": False, "logging_level": "error"}
+        if address == "local":
+            needed = math.ceil(sum(step.cpus for step in plan.steps))
+            options |= {
+                "num_cpus": cpus or max(os.cpu_count() or 1, needed),
+                "include_dashboard": False,
+                "object_store_memory": OBJECT_STORE_BYTES,
+            }
+        check_answers(address)
+        try:
+            ray.init(address=address, **options)
+        except Exception as error:  # Ray raises several types, and a bare Exception for a start that took too long
+            message = " ".join(str(error).split())
+            raise RayError(f"no Ray cluster at {address}: {message}; start it, or leave --ray-address out") from error
     try:
         counts = count_actors(plan.steps, ray.cluster_resources(), most)
         asyncio.run(_Actors(ray, plan, patience).run(refs, counts, settle))
     finally:
         if here:
             ray.shutdown()
-
-
-def _connect(ray: Any, plan: IngestPlan, address: str, cpus: float | None) -> None:
-    options: dict[str, Any] = {}
-    if address == "local":
-        needed = math.ceil(sum(step.cpus for step in plan.steps))
-        options = {
-            "num_cpus": cpus or max(os.cpu_count() or 1, needed),
-            "include_dashboard": False,
-            "object_store_memory": OBJECT_STORE_BYTES,
-        }
-    check_answers(address)
-    try:
-        ray.init(address=address, log_to_driver=False, logging_level="error", **options)
-    except Exception as error:  # Ray raises several types, and a bare Exception for a start that took too long
-        message = " ".join(str(error).split())
-        raise RayError(f"no Ray cluster at {address}: {message}; start it, or leave --ray-address out") from error
 
 
 def check_answers(address: str) -> None:

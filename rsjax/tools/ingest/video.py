@@ -358,11 +358,7 @@ class _Decoder:
         self._container.close()
 
     def picture(self, number: int) -> UInt8[np.ndarray, "H W 3"]:
-        """Decodes one frame of the file."""
-        return _upright(self._decode(number))
-
-    def _decode(self, number: int) -> Any:
-        """Decodes a frame from the current position if that is nearest, else from a key frame before the frame.
+        """Decodes one frame of the file, from the current position if that is nearest, else from an earlier key frame.
 
         In an open group of pictures the first frames depend on the previous group. So if the nearest key frame is not
         enough, decoding starts at the one before it, and then at the first frame.
@@ -375,10 +371,12 @@ class _Decoder:
                 if start is not None:
                     self._container.seek(int(self.index.labels[start]), stream=self._stream, backward=True)
                     self._frames = decoded(self._container)
-                if (frame := self._decode_until(number)) is not None:
-                    return frame
+                frame = self._decode_until(number)
             except (av.FFmpegError, OSError) as error:
                 reason = error
+                continue
+            if frame is not None:
+                return _upright(frame)
         seconds = float(self.index.stamps[number] * self.index.time_base)
         raise EpisodeError.at(self.path, f"frame {number} (at {seconds:.3f} s) cannot be decoded: {reason}")
 

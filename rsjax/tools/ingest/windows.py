@@ -190,11 +190,13 @@ def judge(
     # Rounding to recorded frames makes some steps longer than 1 / rate although no frame is missing.
     steps = np.maximum(numbers * recorded, 1 / config.rate if config.rate else 0.0)
     torn = ((seconds > config.most_gap * steps) | (numbers < 1)).any(1)
-    # nan passes both bounds
-    if motion is None:
-        means = np.full(len(index), np.nan)
-    else:
-        means = _window_means(motion, index)
+    means = np.full(len(index), np.nan)  # nan passes both bounds
+    if motion is not None:
+        # The first frame's own motion lies before the window.
+        sums = np.concatenate([[0.0], np.cumsum(motion, dtype=np.float64)])
+        first = frames[:, 0]
+        last = frames[:, -1]
+        means = (sums[last + 1] - sums[first + 1]) / np.maximum(last - first, 1)
     keys = np.sort(np.asarray(key_frames, np.int64))
     has_key = np.searchsorted(keys, frames[:, 0]) < np.searchsorted(keys, frames[:, -1], "right")
     reasons = {
@@ -219,11 +221,3 @@ def starts_by_reason(index: WindowIndex, reasons: Sequence[str]) -> dict[str, li
         if reason:
             starts.setdefault(reason, []).append(start)
     return starts
-
-
-def _window_means(motion: Float[np.ndarray, " N"], index: WindowIndex) -> Float[np.ndarray, " W"]:
-    """Returns the mean motion after each window's first frame up to its last; the first frame's own lies before it."""
-    sums = np.concatenate([[0.0], np.cumsum(motion, dtype=np.float64)])
-    first = index.frames[:, 0]
-    last = index.frames[:, -1]
-    return (sums[last + 1] - sums[first + 1]) / np.maximum(last - first, 1)

@@ -186,19 +186,15 @@ class Expert:
         if 0 <= self.manner.leave <= self._step:
             action = self._wander(state)
         else:
-            action = self._expert(state)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # the policy warns that actions will be clipped
+                action = np.clip(np.array(self._policy.get_action(state), np.float64), -1, 1)
         if self._step < self.manner.delay:
             action[:3] = 0
         fresh = np.sqrt(1 - NOISE_MEMORY**2) * self.manner.noise * self._rng.standard_normal(3)
         self._noise = NOISE_MEMORY * self._noise + fresh
         action[:3] += self._noise
         self._step += 1
-        return np.clip(action, -1, 1)
-
-    def _expert(self, state: Float[np.ndarray, " 39"]) -> Float[np.ndarray, " 4"]:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # the policy warns that actions will be clipped
-            action = np.array(self._policy.get_action(state), np.float64)
         return np.clip(action, -1, 1)
 
     def _wander(self, state: Float[np.ndarray, " 39"]) -> Float[np.ndarray, " 4"]:

@@ -47,8 +47,21 @@ def collect_second_takes(
     make_store(Collection(key, config, {split: plans}, meta), out, report, workers)
     made = open_store(out).source(split)
     takes = {_identity(take): take for take in map(made.__getitem__, range(len(made)))}
+    where = f"{clips.path}, split {split}"
     for record in records:
-        _check(record, takes.get(_identity(record)), f"{clips.path}, split {split}")
+        episode = record["provenance"]["episode"]
+        take = takes.get(_identity(record))
+        if take is None:
+            raise UserError(
+                f"{where}: the simulator failed at the second take of episode {episode}; score without them"
+            )
+        apart = np.abs(take["rgb"][0].astype(np.float32) - record["rgb"][0]).mean()
+        if apart > MAX_START:
+            raise UserError(
+                f"{where}: the second take of episode {episode} starts otherwise than the clip ({apart:.1f} of 255 "
+                f"levels apart), so another version of the simulator made it; score without second takes, or simulate "
+                f"anew"
+            )
     return [takes[_identity(record)] for record in records]
 
 
@@ -79,15 +92,3 @@ def _plan(config: SimConfig, name: str, record: Record) -> EpisodePlan:
     change = origin.get("unseen", {}).get("what")
     replay = Replay(record["actions"], JITTER, origin["expert"])
     return EpisodePlan(name, origin["episode"], task, change, replay, seed=origin["seed"])
-
-
-def _check(record: Record, take: Record | None, where: str) -> None:
-    episode = record["provenance"]["episode"]
-    if take is None:
-        raise UserError(f"{where}: the simulator failed at the second take of episode {episode}; score without them")
-    apart = np.abs(take["rgb"][0].astype(np.float32) - record["rgb"][0]).mean()
-    if apart > MAX_START:
-        raise UserError(
-            f"{where}: the second take of episode {episode} starts otherwise than the clip ({apart:.1f} of 255 levels "
-            f"apart), so another version of the simulator made it; score without second takes, or simulate anew"
-        )

@@ -92,7 +92,10 @@ class Scenery:
         for geom in self._geoms if variation.turn else ():
             color = self._color(geom)
             model.geom_matid[geom] = -1
-            model.geom_rgba[geom] = (*_turned(color[:3], variation.turn), color[3])
+            hue, saturation, value = colorsys.rgb_to_hsv(*map(float, color[:3]))
+            hue = (hue + variation.turn) % 1
+            turned = colorsys.hsv_to_rgb(hue, max(saturation, SATURATION), max(value, VALUE))
+            model.geom_rgba[geom] = (*turned, color[3])
 
     def _move_camera(self, variation: Variation) -> None:
         require(
@@ -142,11 +145,6 @@ def aim(model: Any, camera_id: int, position: Sequence[float], target: Sequence[
     mujoco.mju_mat2Quat(model.cam_quat[camera_id], (axes / np.linalg.norm(axes, axis=0)).ravel())
     model.cam_pos[camera_id] = position
     model.cam_fovy[camera_id] = fovy
-
-
-def _turned(color: Float[np.ndarray, " 3"], turn: float) -> tuple[float, float, float]:
-    hue, saturation, value = colorsys.rgb_to_hsv(*map(float, color))
-    return colorsys.hsv_to_rgb((hue + turn) % 1, max(saturation, SATURATION), max(value, VALUE))
 
 
 def _rotation(axis: Float[np.ndarray, " 3"], degrees: float) -> Float[np.ndarray, "3 3"]:

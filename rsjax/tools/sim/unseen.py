@@ -43,8 +43,13 @@ def collect_unseen(config: SimConfig, clips: Store, episodes: int, report: Repor
     )
     key = content_key("unseen", RECIPE, collection_key(config), episodes)
     splits = {split: _plans(config, split, episodes) for split in unseen_splits(config)}
+    unseen: dict[str, dict[str, Any]] = {
+        "unseen_task": {"tasks": list(config.held_out_tasks)},
+        "unseen_camera": {"yaw_degrees_to_either_side": list(YAW), "pitch_degrees": list(PITCH)},
+        "unseen_color": {"turn_of_hue": list(TURN)},
+    }
     meta = {name: clips.manifest[name] for name in UNITS} | {
-        "unseen": _held_out(config),
+        "unseen": {split: unseen[split] for split in splits},
         "seen": collection_key(config),
     }
     out = clips.path / FOLDER / key
@@ -65,13 +70,3 @@ def _plans(config: SimConfig, split: str, episodes: int) -> tuple[EpisodePlan, .
     tasks = config.held_out_tasks
     new = range(config.episodes, config.episodes + episodes)
     return tuple(EpisodePlan(f"{split}-{i:06d}", i, tasks[i % len(tasks)]) for i in new)
-
-
-def _held_out(config: SimConfig) -> dict[str, Any]:
-    """Returns what is unseen in each split, JSON-ready."""
-    what: dict[str, dict[str, Any]] = {
-        "unseen_task": {"tasks": list(config.held_out_tasks)},
-        "unseen_camera": {"yaw_degrees_to_either_side": list(YAW), "pitch_degrees": list(PITCH)},
-        "unseen_color": {"turn_of_hue": list(TURN)},
-    }
-    return {split: what[split] for split in unseen_splits(config)}

@@ -9,11 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rsjax.clip import Clip
+from rsjax.data.build import clip_labels
 from rsjax.data.codec import Record
 from rsjax.tools.ingest.actions import ActionConfig
 from rsjax.tools.ingest.annotate import Annotated
 from rsjax.tools.ingest.annotators.categories import CategoryConfig
-from rsjax.tools.ingest.clips import ClipConfig, clip_labels, cut
+from rsjax.tools.ingest.clips import ClipConfig, cut
 from rsjax.tools.ingest.episode import Episode, EpisodeError, Segment
 from rsjax.tools.ingest.windows import WindowConfig
 from tests.tools.ingest.toy import Pictures, episode

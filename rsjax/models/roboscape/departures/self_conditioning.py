@@ -49,7 +49,8 @@ def previous_frames(
         own: whether to return the model's codes; the same on all devices.
         prompt_frames: those that generation starts from.
     """
-    true = {name: _codes(grid, code_bits) for name, grid in tokens.items()}
+    cells = {name: grid.reshape(*grid.shape[:2], -1) for name, grid in tokens.items()}
+    true = {name: lfq.tokens_to_codes(grid, code_bits) for name, grid in cells.items()}
 
     def predicted() -> Previous:
         logits, _ = predict()
@@ -59,7 +60,3 @@ def previous_frames(
 
     read: Any = jax.lax.cond(own, predicted, lambda: true)
     return {name: jax.lax.stop_gradient(frame_before(codes)) for name, codes in read.items()}
-
-
-def _codes(grid: Int[Array, "B T H W"], code_bits: int) -> Float[Array, "B T S D"]:
-    return lfq.tokens_to_codes(grid.reshape(*grid.shape[:2], -1), code_bits)

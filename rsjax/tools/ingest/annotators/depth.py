@@ -22,7 +22,7 @@ from jaxtyping import Bool, Float32
 
 from rsjax.data.depth_color import RELATIVE_FAR, stretch
 from rsjax.tools.ingest.annotators.network import Network, checkout_module, library, load_weights, pretrained
-from rsjax.tools.ingest.annotators.protocols import CHUNK, AnnotationError, DepthMaps, Pictures, in_chunks
+from rsjax.tools.ingest.annotators.protocols import CHUNK, AnnotationError, DepthMaps, in_chunks
 from rsjax.tools.ingest.episode import Depths, Episode, EpisodeError
 
 _NEAR_SHARE = 1 / RELATIVE_FAR  # 1/depth of the farthest point, relative to the nearest
@@ -208,21 +208,22 @@ class DepthAnything(Network):
     def __call__(self, episode: Episode, camera: str) -> DepthMaps:
         frames = episode.cameras[camera]
         model, processor = self.load()
-        maps = _on_disk((len(frames), *frames.read([0]).shape[1:3]))
+        torch = library("torch", self.title)
+        shape = (len(frames), *frames.read([0]).shape[1:3])
+        with tempfile.TemporaryFile() as file:  # an episode may exceed the memory
+            # In a sparse file, the write that fills the disk would kill the process.
+            os.posix_fallocate(file.fileno(), 0, 4 * math.prod(shape))
+            maps: Any = np.memmap(file, np.float32, "r+", shape=shape)  # type: ignore[call-overload]
         for start, pictures in in_chunks(frames, size=self.batch):
-            maps[start : start + len(pictures)] = self._estimate(model, processor, pictures)
+            inputs = processor(images=list(pictures), return_tensors="pt").to(self.device)
+            with torch.no_grad():
+                depth = model(**inputs).predicted_depth
+                resized = torch.nn.functional.interpolate(depth[:, None].float(), pictures.shape[1:3], mode="bilinear")
+            maps[start : start + len(pictures)] = resized[:, 0].cpu().numpy()
         return _as_maps(maps, model.config.depth_estimation_type == "metric", episode, camera, self.name)
 
     def build(self) -> tuple[Any, Any]:
         return pretrained(("AutoModelForDepthEstimation", "AutoImageProcessor"), self.model, self.device, self.title)
-
-    def _estimate(self, model: Any, processor: Any, pictures: Pictures) -> Float32[np.ndarray, "T H W"]:
-        torch = library("torch", self.title)
-        inputs = processor(images=list(pictures), return_tensors="pt").to(self.device)
-        with torch.no_grad():
-            depth = model(**inputs).predicted_depth
-            resized = torch.nn.functional.interpolate(depth[:, None].float(), pictures.shape[1:3], mode="bilinear")
-        return resized[:, 0].cpu().numpy()
 
 
 def _as_maps(maps: Float32[np.ndarray, "N H W"], metric: bool, episode: Episode, camera: str, method: str) -> DepthMaps:
@@ -235,15 +236,3 @@ def _as_maps(maps: Float32[np.ndarray, "N H W"], metric: bool, episode: Episode,
         return relative_depth(maps)
     except ValueError as error:
         raise AnnotationError(f"episode {episode.id}: {method}: {error}; check weights and precision") from error
-
-
-def _on_disk(shape: tuple[int, ...]) -> Float32[np.ndarray, "N H W"]:
-    """Makes an array in a temporary file without a name, so that an episode may exceed the memory.
-
-    Raises:
-        OSError: the disk has no space for it.
-    """
-    with tempfile.TemporaryFile() as file:
-        # In a sparse file, the write that fills the disk would kill the process.
-        os.posix_fallocate(file.fileno(), 0, 4 * math.prod(shape))
-        return np.memmap(file, np.float32, "r+", shape=shape)  # type: ignore[call-overload,no-any-return]

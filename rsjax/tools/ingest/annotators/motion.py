@@ -103,26 +103,23 @@ class RaftFlow(Network):
 
     def __call__(self, before: Pictures, after: Pictures) -> Float32[np.ndarray, "T H W 2"]:
         model = self.load()
-        starts = range(0, len(before), self.batch)
-        flows = [self._flow(model, before[i : i + self.batch], after[i : i + self.batch]) for i in starts]
-        if flows:
-            return np.concatenate(flows)
-        return np.zeros((*before.shape[:3], 2), np.float32)
+        torch = library("torch", self.title)
+        resize = torch.nn.functional.interpolate
+        height, width = before.shape[1:3]
+        size = [max(_RAFT_LEAST, round(side / _RAFT_MULTIPLE) * _RAFT_MULTIPLE) for side in (height, width)]
+        unit = np.array([width / size[1], height / size[0]], np.float32)
+        flows = [np.zeros((0, height, width, 2), np.float32)]
+        for start in range(0, len(before), self.batch):
+            pair = [torch.from_numpy(x[start : start + self.batch]).to(self.device) for x in (before, after)]
+            pair = [x.permute(0, 3, 1, 2).float() / 127.5 - 1 for x in pair]
+            with torch.no_grad():
+                pair = [resize(x, size, mode="bilinear", antialias=True) for x in pair]
+                flow = model(*pair, num_flow_updates=self.updates)[-1]
+                flow = resize(flow, (height, width), mode="bilinear")
+            flows.append(flow.permute(0, 2, 3, 1).cpu().numpy() * unit)
+        return np.concatenate(flows)
 
     def build(self) -> Any:
         flows = library("torchvision.models.optical_flow", self.title)
         model = getattr(flows, f"raft_{self.size}")(weights=None)
         return load_weights(model, self.weights, self.device, f"{self.title} ({self.size})")
-
-    def _flow(self, model: Any, before: Pictures, after: Pictures) -> Float32[np.ndarray, "T H W 2"]:
-        torch = library("torch", self.title)
-        height, width = before.shape[1:3]
-        size = [max(_RAFT_LEAST, round(side / _RAFT_MULTIPLE) * _RAFT_MULTIPLE) for side in (height, width)]
-        resize = torch.nn.functional.interpolate
-        pair = [torch.from_numpy(x).to(self.device).permute(0, 3, 1, 2).float() / 127.5 - 1 for x in (before, after)]
-        with torch.no_grad():
-            pair = [resize(x, size, mode="bilinear", antialias=True) for x in pair]
-            flow = model(*pair, num_flow_updates=self.updates)[-1]
-            flow = resize(flow, (height, width), mode="bilinear")
-        unit = np.array([width / size[1], height / size[0]], np.float32)
-        return flow.permute(0, 2, 3, 1).cpu().numpy() * unit

@@ -227,7 +227,12 @@ def parse_answer(text: str, count: int) -> Answer:
     names = {*MOST_LETTERS, "key_picture"}
     if not isinstance(values, dict) or values.keys() != names:
         raise AnswerError(f"it is not an object with the fields {', '.join(sorted(names))} alone")
-    texts = {name: _text(name, values[name], most) for name, most in MOST_LETTERS.items()}
+    texts = {}
+    for name, most in MOST_LETTERS.items():
+        value = values[name]
+        if not isinstance(value, str) or len(value) > most:
+            raise AnswerError(f"{name} is not a text of at most {most} letters")
+        texts[name] = " ".join(value.split())
     if not texts["action"]:
         raise AnswerError("action is empty")
     key = values["key_picture"]
@@ -236,9 +241,3 @@ def parse_answer(text: str, count: int) -> Answer:
     if len(texts["skill"].split()) != 1:
         raise AnswerError("skill is not one word")
     return Answer(texts["action"], texts["skill"].lower(), texts["scene"], key - 1)
-
-
-def _text(name: str, value: Any, most: int) -> str:
-    if not isinstance(value, str) or len(value) > most:
-        raise AnswerError(f"{name} is not a text of at most {most} letters")
-    return " ".join(value.split())

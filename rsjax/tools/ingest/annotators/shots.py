@@ -72,24 +72,16 @@ def histogram_changes(frames: Frames) -> Float32[np.ndarray, " N"]:
     last = None
     for start, pictures in in_chunks(frames):
         for t, picture in enumerate(pictures, start):
-            histogram = _histogram(picture)
-            if last is None:
-                changes[t] = 0.0
-            else:
+            scale = min(1.0, _SIDE / max(picture.shape[:2]))
+            if scale < 1:
+                picture = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+            hsv = cv2.cvtColor(picture, cv2.COLOR_RGB2HSV)
+            histogram = cv2.calcHist([hsv], [0, 1, 2], None, list(_BINS), [0, 180, 0, 256, 0, 256]).ravel()
+            histogram = histogram / histogram.sum()
+            if last is not None:
                 changes[t] = np.abs(histogram - last).sum() / 2
             last = histogram
     return changes
-
-
-def _histogram(picture: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, " bins"]:
-    scale = min(1.0, _SIDE / max(picture.shape[:2]))
-    if scale < 1:
-        small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    else:
-        small = picture
-    hsv = cv2.cvtColor(small, cv2.COLOR_RGB2HSV)
-    histogram = cv2.calcHist([hsv], [0, 1, 2], None, list(_BINS), [0, 180, 0, 256, 0, 256])
-    return histogram.ravel() / histogram.sum()
 
 
 @dataclass(frozen=True)

@@ -249,7 +249,14 @@ class SpatialTracker(GridTracker, Network):
         # for fewer frames than half its window its output is zeros, with no point visible
         kept = np.arange(max(count, self.window)).clip(max=count - 1)
         video = torch.from_numpy(pictures[kept]).to(self.device).permute(0, 3, 1, 2)[None].float()
-        maps = torch.from_numpy(_usable(np.asarray(depth, np.float32))[kept]).to(self.device)[:, None]
+        measured = np.asarray(depth, np.float32)
+        beyond = measured[measured > _LEAST_DEPTH]
+        # SpatialTracker divides by the spread of depth beyond a centimetre, and NaN starts its debugger.
+        if not np.isfinite(measured).all() or not beyond.size or not np.ptp(beyond):
+            raise AnnotationError(
+                "SpatialTracker needs depth that is finite and not the same everywhere; choose another depth or tracker"
+            )
+        maps = torch.from_numpy(measured[kept]).to(self.device)[:, None]
         rows = torch.from_numpy(queries)[None].to(self.device)
         with torch.no_grad():
             places, seen, _ = model(video, video_depth=maps, queries=rows, wind_length=self.window)
@@ -304,16 +311,6 @@ class BootsTapir(GridTracker, Network):
     def build(self) -> Any:
         module = checkout_module(self.checkout, "tapnet.torch.tapir_model", self.title)
         return load_weights(module.TAPIR(pyramid_level=1), self.weights, self.device, self.title)
-
-
-def _usable(depth: Maps) -> Maps:
-    """Checks the depth: SpatialTracker divides by its spread beyond a centimetre, and NaN starts its debugger."""
-    measured = depth[depth > _LEAST_DEPTH]
-    if not np.isfinite(depth).all() or not measured.size or not np.ptp(measured):
-        raise AnnotationError(
-            "SpatialTracker needs depth that is finite and not the same everywhere; choose another depth or tracker"
-        )
-    return depth
 
 
 def _cleaned(places: np.ndarray, seen: np.ndarray, points: Points) -> Followed:

@@ -221,7 +221,12 @@ class LeRobot:
             states = None
         layout = layout_of(align_actions(actions), *self._declared, dimensions, states)
         check_layout(layout, actions.shape[1], path)
-        tasks = self._task_of_rows(table, path)
+        tasks: list[str] = []
+        if "task_index" in table.column_names and self._tasks:
+            indices = integers(table, "task_index", path).tolist()
+            if unknown := set(indices) - set(self._tasks):
+                raise EpisodeError.at(path, f"task_index {min(unknown)} is not among the data set's tasks")
+            tasks = [self._tasks[index] for index in indices]
         meta: dict[str, Any] = {"actions": layout.to_json(), "action_names": dimensions}
         meta |= _outcome(table, path, notes)
         if self._exported:
@@ -230,6 +235,12 @@ class LeRobot:
             meta["source"] = GENERATED
         if notes:
             meta["notes"] = notes
+        cameras: dict[str, Frames] = {}
+        for key, video in location["videos"].items():
+            file = media(inside(self._root, video["path"]))
+            cameras[_camera(key)] = at_times(file, times + video["from"], _tolerance(times))
+        for key in self._info.of_type("image"):
+            cameras[_camera(key)] = TablePictures(path, key, location)
         episode = Episode(
             id=ref.id,
             fingerprint=ref.fingerprint,
@@ -238,7 +249,7 @@ class LeRobot:
             timestamps=times - times[0],
             actions=align_actions(actions),
             states=states,
-            cameras=self._cameras(location, times, path),
+            cameras=cameras,
             segments=tuple(runs(tasks)) if len(set(tasks)) > 1 else (),
             meta=meta,
         )
@@ -325,23 +336,6 @@ class LeRobot:
             raise EpisodeError.at(path, f"timestamp of row {row + 1} comes {step}", kind="time")
         return notes
 
-    def _task_of_rows(self, table: pa.Table, path: Path) -> list[str]:
-        if "task_index" not in table.column_names or not self._tasks:
-            return []
-        indices = integers(table, "task_index", path).tolist()
-        if unknown := set(indices) - set(self._tasks):
-            raise EpisodeError.at(path, f"task_index {min(unknown)} is not among the data set's tasks")
-        return [self._tasks[index] for index in indices]
-
-    def _cameras(self, location: dict[str, Any], times: Float[np.ndarray, " N"], path: Path) -> dict[str, Frames]:
-        cameras: dict[str, Frames] = {}
-        for key, video in location["videos"].items():
-            file = media(inside(self._root, video["path"]))
-            cameras[_camera(key)] = at_times(file, times + video["from"], _tolerance(times))
-        for key in self._info.of_type("image"):
-            cameras[_camera(key)] = TablePictures(path, key, location)
-        return cameras
-
 
 def _outcome(table: pa.Table, path: Path, notes: dict[str, str]) -> dict[str, Any]:
     """Returns what the columns ``next.…`` say of each frame: ``success`` and ``reward``, if they are there.
@@ -352,7 +346,12 @@ def _outcome(table: pa.Table, path: Path, notes: dict[str, str]) -> dict[str, An
     Args:
         notes: gets an entry if the episode goes on after ``next.done``.
     """
-    columns = {name: _numbers(table, name, path)[:, 0] for name in OUTCOME if name in table.column_names}
+    columns = {}
+    for name in (name for name in OUTCOME if name in table.column_names):
+        values = matrix(table, name, path)
+        if values.shape[1] != 1 or not np.isfinite(values).all():
+            raise EpisodeError.at(path, f"column {name!r} is not one finite number a row")
+        columns[name] = values[:, 0]
     made: dict[str, Any] = {}
     reward = columns.get("next.reward")
     success = columns.get("next.success")
@@ -368,13 +367,6 @@ def _outcome(table: pa.Table, path: Path, notes: dict[str, str]) -> dict[str, An
     if done.size and done[0] < len(table) - 1:
         notes["done"] = f"next.done at row {done[0]}, after which {len(table) - 1 - done[0]} rows follow"
     return made
-
-
-def _numbers(table: pa.Table, column: str, path: Path) -> Float[np.ndarray, "N 1"]:
-    values = matrix(table, column, path)
-    if values.shape[1] != 1 or not np.isfinite(values).all():
-        raise EpisodeError.at(path, f"column {column!r} is not one finite number a row")
-    return values
 
 
 def _generated(path: Path) -> frozenset[int]:

@@ -125,12 +125,9 @@ class RldsSource:
             counts = expected.get(shard, 0), "dataset_info.json names"
             settings = {n: v for n, v in asdict(self.keys).items() if self.keys.depth or not n.startswith("depth")}
             yield from record_refs(self.folder, shard, f"{stem}-{{:05d}}", counts, settings)
-        if not self.single:
-            yield from self._missing_shards()
-
-    def _missing_shards(self) -> Iterator[EpisodeRef]:
-        """Yields a reference for each split that lacks shards, judged by the names of its other shards."""
-        numbers: dict[tuple[str, str, int], set[int]] = {}
+        if self.single:
+            return
+        numbers: dict[tuple[str, str, int], set[int]] = {}  # of the shards of each split
         for match in filter(None, map(_SHARD.fullmatch, self.shards)):
             numbers.setdefault((match["name"], match["split"], int(match["shards"])), set()).add(int(match["number"]))
         for (_, split, total), present in numbers.items():

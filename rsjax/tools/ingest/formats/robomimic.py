@@ -156,43 +156,42 @@ class DemoSource:
             group = member(file, f"data/{demo}", path)
             if not isinstance(group, h5py.Group) or not isinstance(member(group, "obs", path), h5py.Group | None):
                 raise EpisodeError.at(path, f"has no group data/{demo}", LEAVE_OUT)
-            return checked(self._episode(ref, path, group, settings_of(file["data"], path)), f"{path}: data/{demo}")
-
-    def _episode(self, ref: EpisodeRef, path: Path, group: Any, settings: dict[str, Any]) -> Episode:
-        how = self.convention
-        commands = rows(group, "actions", path)
-        samples = attribute(group, "num_samples")
-        if samples is not None and int(samples) != len(commands):
-            problem = f"{group.name}/actions has {len(commands)} rows, num_samples says {int(samples)}"
-            raise EpisodeError.at(path, problem)
-        cameras, depth = self.pictures(group, path)
-        fps = fps_of(settings, path) or how.fps
-        states, flipped = _states(group.get("obs", {}), how, path)
-        named = path.stem.removesuffix("_demo").replace("_", " ")  # LIBERO names files after tasks
-        width = commands.shape[1]  # a gripper is the last of each arm's seven dimensions, else the last of all
-        if width % 7 == 0:
-            grippers = tuple(range(6, width, 7))
-        else:
-            grippers = (width - 1,)
-        return Episode(
-            id=ref.id,
-            fingerprint=ref.fingerprint,
-            task=instruction_of(group, settings) or (named if how.after else words_of(settings.get("env_name"))),
-            fps=fps,
-            timestamps=np.arange(len(commands)) / fps,
-            actions=align_actions(commands, how.after),
-            states=states,
-            cameras=cameras,
-            depth=depth,
-            meta={
-                "source": how.name,
-                "file": ref.location["file"],
-                "demo": ref.location["demo"],
-                "environment": words_of(settings.get("env_name")),
-                "notes": {"flipped": flipped} if flipped else {},
-                "actions": Layout(kind_of(settings), held=grippers).to_json(),
-            },
-        )
+            settings = settings_of(file["data"], path)
+            how = self.convention
+            commands = rows(group, "actions", path)
+            samples = attribute(group, "num_samples")
+            if samples is not None and int(samples) != len(commands):
+                problem = f"{group.name}/actions has {len(commands)} rows, num_samples says {int(samples)}"
+                raise EpisodeError.at(path, problem)
+            cameras, depth = self.pictures(group, path)
+            fps = fps_of(settings, path) or how.fps
+            states, flipped = _states(group.get("obs", {}), how, path)
+            named = path.stem.removesuffix("_demo").replace("_", " ")  # LIBERO names files after tasks
+            width = commands.shape[1]  # a gripper is the last of each arm's seven dimensions, else the last of all
+            if width % 7 == 0:
+                grippers = tuple(range(6, width, 7))
+            else:
+                grippers = (width - 1,)
+            episode = Episode(
+                id=ref.id,
+                fingerprint=ref.fingerprint,
+                task=instruction_of(group, settings) or (named if how.after else words_of(settings.get("env_name"))),
+                fps=fps,
+                timestamps=np.arange(len(commands)) / fps,
+                actions=align_actions(commands, how.after),
+                states=states,
+                cameras=cameras,
+                depth=depth,
+                meta={
+                    "source": how.name,
+                    "file": ref.location["file"],
+                    "demo": ref.location["demo"],
+                    "environment": words_of(settings.get("env_name")),
+                    "notes": {"flipped": flipped} if flipped else {},
+                    "actions": Layout(kind_of(settings), held=grippers).to_json(),
+                },
+            )
+            return checked(episode, f"{path}: data/{demo}")
 
     def pictures(self, group: Any, path: Path) -> Pictures:
         """Returns the pictures and depth maps of a demo by camera, rendered if it has none.

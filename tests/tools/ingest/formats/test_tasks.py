@@ -12,8 +12,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from rsjax.clip import words_of
+from rsjax.data.build import clip_labels
 from rsjax.tools.ingest.annotate import Annotated
-from rsjax.tools.ingest.clips import ClipConfig, clip_labels, cut
+from rsjax.tools.ingest.clips import ClipConfig, cut
 from rsjax.tools.ingest.windows import WindowConfig
 from tests.tools.ingest.formats.reading import read_all
 from tests.tools.ingest.formats.test_folder import write_episode
