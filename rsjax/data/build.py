@@ -190,7 +190,16 @@ def _record(clip: Mapping[str, Any], where: str, number: int) -> Record:
     words = {name: _text(clip, name, where) or words_of(origin.get(name)) or UNKNOWN for name in _LABELS}
     timing: dict[str, Any] = {}
     if clip.get("fps") is not None:
-        timing = {"fps": _rate(clip["fps"], where), "frames": list(range(count))}
+        try:
+            rate = float(clip["fps"])
+        except (TypeError, ValueError, OverflowError):
+            rate = math.nan
+        if isinstance(clip["fps"], bool) or not 0 < rate <= MOST_FPS:
+            raise StoreError(
+                f"{where}: fps is {clip['fps']!r:.80}; it is frames per second, above 0 and at most {MOST_FPS:g}: "
+                f"leave it out if unknown"
+            )
+        timing = {"fps": rate, "frames": list(range(count))}
     return {
         "rgb": rgb,
         "depth": depth,
@@ -230,20 +239,6 @@ def _success(clip: Mapping[str, Any], where: str, count: int) -> Bool[np.ndarray
     if success.dtype.kind not in "biuf" or not np.isin(success, (0, 1)).all():
         raise StoreError(f"{where}: success is {clip['success']!r:.80}, should be True or False")
     return np.broadcast_to(success.astype(bool), (count,)).copy()
-
-
-def _rate(fps: Any, where: str) -> float:
-    """Returns frames per second."""
-    try:
-        rate = float(fps)
-    except (TypeError, ValueError, OverflowError):
-        rate = math.nan
-    if isinstance(fps, bool) or not 0 < rate <= MOST_FPS:
-        raise StoreError(
-            f"{where}: fps is {fps!r:.80}; it is frames per second, above 0 and at most {MOST_FPS:g}: leave it out if "
-            f"unknown"
-        )
-    return rate
 
 
 def _provenance(clip: Mapping[str, Any], where: str) -> dict[str, Any]:

@@ -186,19 +186,12 @@ class Loader:
         return self
 
     def __next__(self) -> Arrays:
-        arrays = self._fetch()
-        self._place += self._batch_size
-        local = np.arange(self._batch_size // self._shard.shard_count, dtype=np.int32)
-        return arrays | {"index": self._shard.shard_index + self._shard.shard_count * local}
-
-    def _fetch(self) -> Arrays:
         while True:
             if self._iterator is None:
                 self._iterator = iter(self._cut())
             try:
                 arrays = next(self._iterator)
-                self._restarts = 0
-                return arrays
+                break
             except RuntimeError as error:  # from Grain: a worker was killed, usually for lack of memory
                 if not self._workers or "terminated unexpectedly" not in str(error):
                     raise
@@ -210,6 +203,10 @@ class Loader:
                         f"run again with fewer workers (now {self._workers})"
                     ) from error
                 _log.warning("a process that reads data died (%s); it is started again", error)
+        self._restarts = 0
+        self._place += self._batch_size
+        local = np.arange(self._batch_size // self._shard.shard_count, dtype=np.int32)
+        return arrays | {"index": self._shard.shard_index + self._shard.shard_count * local}
 
     def _cut(self) -> grain.IterDataset:
         shard = self._shard

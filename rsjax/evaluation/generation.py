@@ -75,7 +75,10 @@ class Generation:
 
     def make(self, index: int = 0, count: int = 1) -> None:
         """Generates the batches that do not exist yet; with ``count`` processes, only the share of number ``index``."""
-        batches = list(self._batches())[index::count]
+        rows = [(kind, draw) for kind, actions in self.draws.items() for draw in range(len(actions))]
+        rows += [(SAMPLE, sample) for sample in range(1, self.protocol.samples)]
+        runs = range(self.protocol.repetitions)
+        batches = [batch for run in runs for kind, draw in rows for batch in self._row(run, kind, draw)][index::count]
         with Progress("evaluation", sum(batch.clips for batch in batches), "rollouts") as progress:
             done = 0
             for batch in batches:
@@ -100,14 +103,6 @@ class Generation:
             records = [self._record(batch) for batch in self._row(run, SAMPLE, sample)]
             out.append({name: np.concatenate([record[name] for record in records]) for name in records[0]})
         return out
-
-    def _batches(self) -> Iterator[Batch]:
-        for run in range(self.protocol.repetitions):
-            for kind, actions in self.draws.items():
-                for draw in range(len(actions)):
-                    yield from self._row(run, kind, draw)
-            for sample in range(1, self.protocol.samples):
-                yield from self._row(run, SAMPLE, sample)
 
     def _row(self, run: int, kind: str, draw: int) -> Iterator[Batch]:
         count = len(self.clips.rgb)

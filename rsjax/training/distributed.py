@@ -87,7 +87,25 @@ def initialize(coordinator: str = "", processes: int | None = None, process_id: 
     on_tpu = "TPU_SKIP_MDS_QUERY" not in os.environ and importlib.util.find_spec("libtpu") is not None
     if alone and not peers and not on_tpu:
         return
-    arguments = {} if alone else _address(coordinator, processes, process_id)
+    arguments: dict[str, Any] = {}
+    if not alone:
+        options = {"--coordinator": coordinator or None, "--processes": processes, "--process-id": process_id}
+        missing = [name for name, value in options.items() if value is None]
+        if processes is None or process_id is None or missing:
+            raise HostsError(
+                f"{' and '.join(missing)} missing; several hosts need {', '.join(options)}, or none of them"
+            )
+        if not 0 <= process_id < processes:
+            raise HostsError(f"--process-id is {process_id}; with --processes {processes} it is 0 … {processes - 1}")
+        host, _, port = coordinator.rpartition(":")
+        if not host or not (port.isascii() and port.isdecimal() and 0 < int(port) < 2**16):
+            raise HostsError(f"--coordinator is {coordinator!r}; it is HOST:PORT of process 0")
+        arguments = {
+            "coordinator_address": coordinator,
+            "num_processes": processes,
+            "process_id": process_id,
+            "cluster_detection_method": "deactivate",  # with Slurm's on, a process would get only one of its devices
+        }
     if processes == 1:
         return
     # Otherwise jax handles SIGTERM itself, and a process that gets it does not stop.
@@ -105,26 +123,6 @@ def initialize(coordinator: str = "", processes: int | None = None, process_id: 
             f"all of them, with the same --coordinator and --processes, and a --coordinator that all of them can reach"
         ) from error
     patient.set()  # a process that ended alone would end the others too
-
-
-def _address(coordinator: str, processes: int | None, process_id: int | None) -> dict[str, Any]:
-    """Checks the options; returns them as arguments of ``jax.distributed.initialize``."""
-    options = {"--coordinator": coordinator or None, "--processes": processes, "--process-id": process_id}
-    missing = [name for name, value in options.items() if value is None]
-    if processes is None or process_id is None or missing:
-        raise HostsError(f"{' and '.join(missing)} missing; several hosts need {', '.join(options)}, or none of them")
-    if not 0 <= process_id < processes:
-        raise HostsError(f"--process-id is {process_id}; with --processes {processes} it is 0 … {processes - 1}")
-    host, _, port = coordinator.rpartition(":")
-    if not host or not (port.isascii() and port.isdecimal() and 0 < int(port) < 2**16):
-        raise HostsError(f"--coordinator is {coordinator!r}; it is HOST:PORT of process 0")
-    # With Slurm's detection active, a process would get only one of its devices.
-    return {
-        "coordinator_address": coordinator,
-        "num_processes": processes,
-        "process_id": process_id,
-        "cluster_detection_method": "deactivate",
-    }
 
 
 def is_lead() -> bool:

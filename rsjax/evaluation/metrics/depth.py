@@ -244,30 +244,21 @@ def depth_scores(
             f"true depth of video {np.argwhere(~counted)[0][0]} has no pixel (or a frame without one) "
             f"between {protocol.min_truth} and {upper} metres"
         )
-    rows = [
-        _video_scores(d, np.clip(align(d, p, m, alignment), _MIN_PREDICTION, upper), m, protocol)
-        for d, p, m in zip(truth, prediction, mask, strict=True)
-    ]
-    absolute, first, second = np.array([scores for scores, _ in rows]).T
+    axes = (1, 2) if protocol.averaging == "frame" else None
+    videos = []
+    frames = []
+    for d, p, m in zip(truth, prediction, mask, strict=True):
+        aligned = np.clip(align(d, p, m, alignment), _MIN_PREDICTION, upper)
+        d = np.where(m, d, 1.0)
+        per_pixel = [abs_rel(d, aligned), within(d, aligned, 1), within(d, aligned, 2)]
+        videos.append([float(np.mean(np.mean(pixels, axis=axes, where=m))) for pixels in per_pixel])
+        valid = m.sum((1, 2))
+        sums = np.stack([np.sum(pixels, axis=(1, 2), where=m) for pixels in per_pixel])
+        frames.append(np.where(valid, sums / np.maximum(valid, 1), np.nan))
+    absolute, first, second = np.array(videos).T
     pooled = protocol.averaging == "pixel"
     weight = mask.sum((1, 2, 3)).astype(np.float64) if pooled else np.ones(len(truth))
-    return DepthScores(absolute, first, second, weight, np.stack([frames for _, frames in rows], axis=1))
-
-
-def _video_scores(
-    truth: Float[np.ndarray, "T H W"],
-    prediction: Float[np.ndarray, "T H W"],
-    mask: Bool[np.ndarray, "T H W"],
-    protocol: Protocol,
-) -> tuple[list[float], Float[np.ndarray, "3 T"]]:
-    """Returns the video's three scores, and those of each frame."""
-    truth = np.where(mask, truth, 1.0)
-    per_pixel = [abs_rel(truth, prediction), within(truth, prediction, 1), within(truth, prediction, 2)]
-    axes = (1, 2) if protocol.averaging == "frame" else None
-    scores = [float(np.mean(np.mean(pixels, axis=axes, where=mask))) for pixels in per_pixel]
-    valid = mask.sum((1, 2))
-    sums = np.stack([np.sum(pixels, axis=(1, 2), where=mask) for pixels in per_pixel])
-    return scores, np.where(valid, sums / np.maximum(valid, 1), np.nan)
+    return DepthScores(absolute, first, second, weight, np.stack(frames, axis=1))
 
 
 def result_key(metric: str, alignment: Alignment = "none", source: DepthSource = "branch") -> str:

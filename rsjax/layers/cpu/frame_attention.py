@@ -75,45 +75,36 @@ def _blocks(causal: bool, cells: int) -> list[slice]:
 
 def _frame(causal: bool, q: Array, k: Array, v: Array) -> tuple[Array, Array]:
     """Returns one frame's output (h, S, e), and the log-sum of each row of its scores (h, S, 1)."""
-    parts = [_block(causal, q[:, rows], k[:, : rows.stop], v[:, : rows.stop]) for rows in _blocks(causal, q.shape[1])]
-    out, log_total = (jnp.concatenate(same, axis=1) for same in zip(*parts, strict=True))
-    return out, log_total
-
-
-def _block(causal: bool, q: Array, k: Array, v: Array) -> tuple[Array, Array]:
-    scores = _scores(q, k, causal)
-    top = jnp.max(scores, axis=-1, keepdims=True)
-    weights = _rounded(jnp.exp(scores - top))
-    total = jnp.sum(weights, axis=-1, keepdims=True, dtype=jnp.float32)
-    return _product("hqk,hke->hqe", weights, v) / total, top + jnp.log(total)
+    outs = []
+    log_totals = []
+    for rows in _blocks(causal, q.shape[1]):
+        scores = _scores(q[:, rows], k[:, : rows.stop], causal)
+        top = jnp.max(scores, axis=-1, keepdims=True)
+        weights = _rounded(jnp.exp(scores - top))
+        total = jnp.sum(weights, axis=-1, keepdims=True, dtype=jnp.float32)
+        outs.append(_product("hqk,hke->hqe", weights, v[:, : rows.stop]) / total)
+        log_totals.append(top + jnp.log(total))
+    return jnp.concatenate(outs, axis=1), jnp.concatenate(log_totals, axis=1)
 
 
 def _frame_gradient(
     causal: bool, q: Array, k: Array, v: Array, g: Array, along: Array, log_total: Array
 ) -> tuple[Array, Array, Array]:
     """Returns one frame's gradients: of queries (h, S, e), and of keys and values transposed, (h, e, S)."""
-    parts = []
+    queries = []
+    keys = []
+    values = []
     cells = q.shape[1]
     for rows in _blocks(causal, cells):
-        seen = (k[:, : rows.stop], v[:, : rows.stop])
-        own = (x[:, rows] for x in (q, g, along, log_total))
-        dq, *of_keys = _block_gradient(causal, *seen, *own)
-        parts.append((dq, *(jnp.pad(x, ((0, 0), (0, 0), (0, cells - rows.stop))) for x in of_keys)))
-    queries, keys, values = zip(*parts, strict=True)
+        seen = k[:, : rows.stop]
+        weights = _rounded(jnp.exp(_scores(q[:, rows], seen, causal) - log_total[:, rows]))
+        of_weights = _product("hqe,hke->hqk", g[:, rows], v[:, : rows.stop])
+        of_scores = _rounded(weights * (of_weights - along[:, rows]))
+        queries.append(_product("hqk,hke->hqe", of_scores, seen))
+        later = ((0, 0), (0, 0), (0, cells - rows.stop))  # keys that these rows do not see
+        keys.append(jnp.pad(_product("heq,hqk->hek", _turned(q[:, rows]), of_scores), later))
+        values.append(jnp.pad(_product("heq,hqk->hek", _turned(g[:, rows]), weights), later))
     return jnp.concatenate(queries, axis=1), sum(keys[1:], keys[0]), sum(values[1:], values[0])
-
-
-def _block_gradient(
-    causal: bool, k: Array, v: Array, q: Array, g: Array, along: Array, log_total: Array
-) -> tuple[Array, Array, Array]:
-    weights = _rounded(jnp.exp(_scores(q, k, causal) - log_total))
-    of_weights = _product("hqe,hke->hqk", g, v)
-    of_scores = _rounded(weights * (of_weights - along))
-    return (
-        _product("hqk,hke->hqe", of_scores, k),
-        _product("heq,hqk->hek", _turned(q), of_scores),
-        _product("heq,hqk->hek", _turned(g), weights),
-    )
 
 
 def _scores(q: Array, k: Array, causal: bool) -> Array:

@@ -69,28 +69,23 @@ class Rotation(NamedTuple):
 
 def rotation(arch: Architecture) -> Rotation:
     """Returns the rotation for rotary positions: a quarter of a head's channels for time, then rows, then columns."""
-    rows, columns = _stretched(arch)
+    rows, columns = arch.grid
+    across: list[np.ndarray] = [np.arange(rows), np.arange(columns)]
+    if arch.model.stretch:  # as in the public sampler
+        high, wide = arch.model.stretch
+        size = (round(wide / columns * rows), wide)
+        if rows / columns > high / wide:
+            size = (high, round(high / rows * columns))
+        begin = [round((whole - part) / 2) for whole, part in zip((high, wide), size, strict=True)]
+        ends = [(b + s) * (n - 1) / n for b, s, n in zip(begin, size, (rows, columns), strict=True)]
+        across = [np.linspace(begin[0], ends[0], rows), np.linspace(begin[1], ends[1], columns)]
     head = arch.model.width // arch.model.heads
     sizes = (head // 4, 3 * head // 8, 3 * head // 8)
-    grid = (np.arange(arch.frames), rows, columns)
+    grid = (np.arange(arch.frames), *across)
     at = [x.reshape(-1, 1) for x in np.meshgrid(*grid, indexing="ij")]
     angles = [x * PERIOD ** -(np.arange(0, size, 2) / size) for x, size in zip(at, sizes, strict=True)]
     whole = np.pad(np.concatenate(angles, axis=1), ((arch.model.text.tokens, 0), (0, 0)))
     return Rotation(np.cos(whole).astype(np.float32), np.sin(whole).astype(np.float32))
-
-
-def _stretched(arch: Architecture) -> tuple[np.ndarray, np.ndarray]:
-    """Returns rows' and columns' positions: 0, 1, …, or stretched over ``model.stretch`` as in the public sampler."""
-    rows, columns = arch.grid
-    if not arch.model.stretch:
-        return np.arange(rows), np.arange(columns)
-    high, wide = arch.model.stretch
-    size = (round(wide / columns * rows), wide)
-    if rows / columns > high / wide:
-        size = (high, round(high / rows * columns))
-    begin = [round((whole - part) / 2) for whole, part in zip((high, wide), size, strict=True)]
-    ends = [(b + s) * (n - 1) / n for b, s, n in zip(begin, size, (rows, columns), strict=True)]
-    return np.linspace(begin[0], ends[0], rows), np.linspace(begin[1], ends[1], columns)
 
 
 def turned(x: Float[Array, "B N K e"], by: Rotation) -> Float[Array, "B N K e"]:
@@ -177,7 +172,14 @@ class Transformer(nn.Module):
             shape = (arch.texts, cfg.text.tokens, cfg.text.width)
             text = self.param("task_tokens", nn.initializers.normal(1.0), shape)[text]
         text = nn.Dense(cfg.width, kernel_init=XAVIER, name="text_proj")(text)
-        x = jnp.concatenate([text, self._video(latents, image)], axis=1)
+        if cfg.image == "channels":
+            known = jnp.zeros_like(latents)
+            if image is not None:
+                known = known.at[:, 0].set(image)
+            latents = jnp.concatenate([latents, known], axis=-1)
+        patch = (cfg.patch_size, cfg.patch_size)
+        x = nn.Conv(cfg.width, patch, patch, "VALID", kernel_init=XAVIER, name="patches")(latents)
+        x = jnp.concatenate([text, x.reshape(len(x), -1, cfg.width)], axis=1)
         if cfg.positions == "sincos":
             x = x + fixed_positions(arch)
         if cfg.learned_positions:
@@ -203,17 +205,6 @@ class Transformer(nn.Module):
         x = x.reshape(len(x), arch.frames, *arch.grid, arch.channels, cfg.patch_size, cfg.patch_size)
         x = x.transpose(0, 1, 2, 5, 3, 6, 4)
         return x.reshape(len(x), arch.frames, arch.rows, arch.columns, arch.channels)
-
-    def _video(self, latents: Float[Array, "B F h w C"], image: Float[Array, "B h w C"] | None) -> Tokens:
-        cfg = self.arch.model
-        if cfg.image == "channels":
-            known = jnp.zeros_like(latents)
-            if image is not None:
-                known = known.at[:, 0].set(image)
-            latents = jnp.concatenate([latents, known], axis=-1)
-        patch = (cfg.patch_size, cfg.patch_size)
-        x = nn.Conv(cfg.width, patch, patch, "VALID", kernel_init=XAVIER, name="patches")(latents)
-        return x.reshape(len(x), -1, cfg.width)
 
     def init_params(self, key: Key[Array, ""]) -> Params:
         """Returns initial parameters, with which the network predicts zeros."""

@@ -170,7 +170,12 @@ class DiT(nn.Module):
             unroll=min(cfg.unroll, pairs),
         )
         x, _ = scan(cfg, name="blocks")(x, (acted, plain), jnp.arange(pairs) == 0)
-        return self._final(x, last)[..., : cfg.inputs]
+        ada = nn.Dense(2 * cfg.width, kernel_init=ZEROS, name="final_ada")(nn.silu(last))
+        shift, scale = jnp.split(ada, 2, axis=-1)
+        p = cfg.patch_size
+        x = nn.Dense(p**2 * cfg.outputs, kernel_init=ZEROS, name="final")(modulate(x, shift, scale))
+        x = x.reshape(*x.shape[:2], *cfg.grid, p, p, cfg.outputs).swapaxes(3, 4)
+        return x.reshape(*x.shape[:2], cfg.rows, cfg.columns, cfg.outputs)[..., : cfg.inputs]
 
     def _action(self, actions: Float[Array, "B T A"], drop: Bool[Array, " B"] | None) -> Float[Array, "B t D"]:
         """Returns the embedding of the actions: one for each frame, or one for all."""
@@ -192,15 +197,6 @@ class DiT(nn.Module):
         if drop is None:
             return x
         return jnp.where(drop[:, None, None], unknown, x)
-
-    def _final(self, x: Tokens, condition: Condition) -> Float[Array, "B T h w outputs"]:
-        cfg = self.config
-        p = cfg.patch_size
-        ada = nn.Dense(2 * cfg.width, kernel_init=ZEROS, name="final_ada")(nn.silu(condition))
-        shift, scale = jnp.split(ada, 2, axis=-1)
-        x = nn.Dense(p**2 * cfg.outputs, kernel_init=ZEROS, name="final")(modulate(x, shift, scale))
-        x = x.reshape(*x.shape[:2], *cfg.grid, p, p, cfg.outputs).swapaxes(3, 4)
-        return x.reshape(*x.shape[:2], cfg.rows, cfg.columns, cfg.outputs)
 
     def init_params(self, key: Key[Array, ""]) -> Params:
         """Returns initial parameters, with which the network predicts zeros."""

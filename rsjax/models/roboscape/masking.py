@@ -66,7 +66,12 @@ def corrupt(
         noisy = dict(clip)
         if config is not None:
             for branch_key, branch in zip(branch_keys, clip, strict=True):
-                noisy[branch] = _replace_sub_tokens(branch_key, clip[branch], rates, code_bits, vocabularies)
+                where_key, code_key = jax.random.split(branch_key)
+                sub_tokens = lfq.split_tokens(clip[branch], code_bits, vocabularies)  # T H W n
+                codes = 2 ** (code_bits // vocabularies)
+                random = jax.random.randint(code_key, sub_tokens.shape, 0, codes, sub_tokens.dtype)
+                where = jax.random.uniform(where_key, sub_tokens.shape) < rates[:, None, None, None]
+                noisy[branch] = lfq.merge_tokens(jnp.where(where, random, sub_tokens), code_bits)
         first = after_prefix(visible_prefix, mask_key, frames, first_masked)
         rate_key, cell_key = jax.random.split(mask_key)
         rate = jnp.cos(jnp.pi / 2 * jax.random.uniform(rate_key, (frames,)))
@@ -89,11 +94,3 @@ def _batch_plan(config: CorruptionConfig, prompt_frames: int, key: Array, frames
     survive = keep * jnp.cumprod(jnp.where(late, decay, 1.0))
     extra = jnp.where(happens & late, 1 - survive, 0.0)
     return 1 - (1 - everywhere) * (1 - extra), jnp.where(happens, drawn, 1)
-
-
-def _replace_sub_tokens(key: Array, tokens: Array, rate: Array, code_bits: int, vocabularies: int) -> Array:
-    where_key, code_key = jax.random.split(key)
-    sub_tokens = lfq.split_tokens(tokens, code_bits, vocabularies)  # T H W n
-    random = jax.random.randint(code_key, sub_tokens.shape, 0, 2 ** (code_bits // vocabularies), sub_tokens.dtype)
-    where = jax.random.uniform(where_key, sub_tokens.shape) < rate[:, None, None, None]
-    return lfq.merge_tokens(jnp.where(where, random, sub_tokens), code_bits)

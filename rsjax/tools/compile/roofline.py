@@ -474,29 +474,17 @@ def convolution_flops(one: Instruction, image: Array, kernel: Array, result: Arr
     ones = ["1"] * len(window.get("size", []))
     places = 1
     for axis, size in enumerate(window.get("size", [])):
-        places *= _places(
-            image.dims[image_labels.index(str(axis))],
-            result.dims[result_labels.index(str(axis))],
-            int(size),
-            int(window.get("stride", ones)[axis]),
-            int(window.get("lhs_dilate", ones)[axis]),
-            int(window.get("rhs_dilate", ones)[axis]),
-            int(window.get("pad", ["0"] * len(ones))[axis].split("_")[0]),
-        )
+        stride = int(window.get("stride", ones)[axis])
+        holes = int(window.get("lhs_dilate", ones)[axis])  # the distance of the image's elements
+        step = int(window.get("rhs_dilate", ones)[axis])  # the distance of the kernel's elements
+        pad = int(window.get("pad", ["0"] * len(ones))[axis].split("_")[0])
+        reach = image.dims[image_labels.index(str(axis))] * holes
+        starts = [out * stride - pad for out in range(result.dims[result_labels.index(str(axis))])]
+        positions = [start + step * element for start in starts for element in range(int(size))]
+        # The pairs of a result and a kernel's element that meet an element of the image.
+        places *= sum(0 <= position < reach and position % holes == 0 for position in positions)
     outputs = result.dims[result_labels.index("b")] * result.dims[result_labels.index("f")]
     return 2 * places * outputs * kernel.dims[kernel_labels.index("i")]
-
-
-def _places(image: int, result: int, size: int, stride: int, holes: int, step: int, pad: int) -> int:
-    """Counts the pairs of a result and a kernel's element, along one axis, that meet an element of the image.
-
-    Args:
-        size: of the kernel, whose elements are ``step`` apart.
-        holes: the distance of the image's elements.
-    """
-    starts = (out * stride - pad for out in range(result))
-    positions = (start + step * element for start in starts for element in range(size))
-    return sum(0 <= position < image * holes and position % holes == 0 for position in positions)
 
 
 def _source(inner: Computation, value: Instruction) -> Instruction:

@@ -213,7 +213,15 @@ def _read_torch(path: Path, holders: Sequence[str]) -> tuple[Tensors, dict[str, 
             read = state is content and name in tensors
         if more := _count(value, torch) - read:
             others[f"the file's key {name}"] = more
-    return {name: _to_numpy(path, name, x, torch) for name, x in tensors.items()}, others, key
+    arrays: Tensors = {}
+    for name, tensor in tensors.items():
+        try:
+            x = tensor.detach()  # parameters that require a gradient refuse numpy()
+            # numpy has no bfloat16; float32 represents each of its numbers.
+            arrays[name] = (x.float() if x.dtype == torch.bfloat16 else x).numpy()
+        except Exception as error:  # torch raises several types for tensors that are sparse, quantized or on no device
+            raise _unreadable(path, name, str(tensor.dtype).removeprefix("torch.")) from error
+    return arrays, others, key
 
 
 def _unpickled(path: Path, torch: Any) -> Any:
@@ -245,15 +253,6 @@ def _count(value: Any, torch: Any) -> int:
     if isinstance(value, list | tuple):
         return sum(_count(x, torch) for x in value)
     return int(isinstance(value, torch.Tensor))
-
-
-def _to_numpy(path: Path, name: str, tensor: Any, torch: Any) -> np.ndarray:
-    try:
-        x = tensor.detach()  # parameters that require a gradient refuse numpy()
-        # numpy has no bfloat16; float32 represents each of its numbers.
-        return (x.float() if x.dtype == torch.bfloat16 else x).numpy()
-    except Exception as error:  # torch raises several types for tensors that are sparse, quantized or on no device
-        raise _unreadable(path, name, str(tensor.dtype).removeprefix("torch.")) from error
 
 
 def _unreadable(path: Path, name: str, dtype: str) -> ConvertError:

@@ -155,7 +155,15 @@ def convert(source: Path, out: Path, heads: int | None = None, part: Part | None
 
 def _convert(source: Path, out: Path, heads: int | None) -> list[str]:
     tensors, metadata, names, others, _ = read_network(source)
-    own = _exported(source, metadata)
+    own = None
+    if METADATA in metadata:
+        try:
+            settings = parse_json(metadata[METADATA])
+            own = (from_dict(IVideoGPTConfig, settings["model"]), Inputs(**settings["inputs"]))
+        except (ValueError, TypeError, KeyError, ConfigError) as error:
+            raise ConvertError(
+                f"{source}: its metadata {METADATA} are of another version or damaged ({error})"
+            ) from error
     if "dynamics_quantize.embedding.weight" in tensors:
         given = None
         if own is not None:
@@ -223,16 +231,6 @@ def export(source: Path, out: Path, part: Part | None = None) -> list[str]:
     tensors = to_tensors(load_part(source, part, shapes), entries)
     write_safetensors(out, tensors, {METADATA: json.dumps({"model": to_dict(model), "inputs": inputs._asdict()})})
     return [f"{out}: {len(tensors)} tensors of iVideoGPT's {part}, under their public names{replaces}"]
-
-
-def _exported(source: Path, metadata: dict[str, str]) -> tuple[IVideoGPTConfig, Inputs] | None:
-    if METADATA not in metadata:
-        return None
-    try:
-        settings = parse_json(metadata[METADATA])
-        return from_dict(IVideoGPTConfig, settings["model"]), Inputs(**settings["inputs"])
-    except (ValueError, TypeError, KeyError, ConfigError) as error:
-        raise ConvertError(f"{source}: its metadata {METADATA} are of another version or damaged ({error})") from error
 
 
 def _llama_shapes(model: IVideoGPTConfig, actions: int) -> Params:

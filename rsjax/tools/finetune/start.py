@@ -63,8 +63,15 @@ def find_source(name: Path | str) -> Source:
                 f"{directory}: holds no {part}/weights; a run has to be finished, and a converted checkpoint needs "
                 f"rsjax convert tokenizer and rsjax convert genie into one directory"
             )
-    if "name" not in read_settings(directory, "make it again"):
-        return _converted(directory)
+    if "name" not in read_settings(directory, "make it again"):  # a converted checkpoint
+        architecture = read_architecture(directory)
+        preset = presets.get(GENIE)
+        assert isinstance(preset.model, GenieConfig)
+        networks = {field.name: getattr(architecture, field.name) for field in fields(TransformerConfig)}
+        networks["action_encoder"] = preset.model.action_encoder
+        tokenizer = replace(read_tokenizer_config(directory), vocabularies=architecture.vocabularies)
+        config = replace(preset, tokenizer=tokenizer, model=replace(preset.model, **networks))
+        return Source(directory, replace(config, eval=replace(config.eval, clips=100, repetitions=1)), architecture)
     config = load_config(directory)
     if not isinstance(config.model, TokenModelConfig):
         raise UserError(
@@ -72,17 +79,6 @@ def find_source(name: Path | str) -> Source:
             f"rsjax train --train.start-from the others"
         )
     return Source(directory, config, read_architecture(directory))
-
-
-def _converted(directory: Path) -> Source:
-    architecture = read_architecture(directory)
-    preset = presets.get(GENIE)
-    assert isinstance(preset.model, GenieConfig)
-    networks = {field.name: getattr(architecture, field.name) for field in fields(TransformerConfig)}
-    networks["action_encoder"] = preset.model.action_encoder
-    tokenizer = replace(read_tokenizer_config(directory), vocabularies=architecture.vocabularies)
-    config = replace(preset, tokenizer=tokenizer, model=replace(preset.model, **networks))
-    return Source(directory, replace(config, eval=replace(config.eval, clips=100, repetitions=1)), architecture)
 
 
 def write_start(source: Source, folder: Path) -> str:

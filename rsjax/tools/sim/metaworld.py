@@ -184,7 +184,11 @@ class Expert:
     def act(self, state: Float[np.ndarray, " 39"]) -> Float[np.ndarray, " 4"]:
         """Returns the next action."""
         if 0 <= self.manner.leave <= self._step:
-            action = self._wander(state)
+            if self._step >= self._until:  # a random target, which changes every third of a second or so
+                self._until = self._step + int(self._rng.integers(20, 45))
+                self._goal = self._rng.uniform(*REACH)
+                self._finger = 1.0 if self._rng.random() < 0.4 else -1.0
+            action = np.append(np.clip(GAIN * (self._goal - state[:3]), -1, 1), self._finger)
         else:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # the policy warns that actions will be clipped
@@ -196,11 +200,3 @@ class Expert:
         action[:3] += self._noise
         self._step += 1
         return np.clip(action, -1, 1)
-
-    def _wander(self, state: Float[np.ndarray, " 39"]) -> Float[np.ndarray, " 4"]:
-        """Returns the action towards a random target, which changes every third of a second or so."""
-        if self._step >= self._until:
-            self._until = self._step + int(self._rng.integers(20, 45))
-            self._goal = self._rng.uniform(*REACH)
-            self._finger = 1.0 if self._rng.random() < 0.4 else -1.0
-        return np.append(np.clip(GAIN * (self._goal - state[:3]), -1, 1), self._finger)

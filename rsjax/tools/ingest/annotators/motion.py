@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Literal
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float, Float32
 
 from rsjax.config import require
 from rsjax.tools.ingest.annotators.network import Network, library, load_weights
@@ -58,7 +58,13 @@ def measure_motion(frames: Frames, timestamps: Float[np.ndarray, " N"], flow: Fl
     for start, pictures in in_chunks(frames, overlap=1):
         if len(pictures) < 2:
             continue
-        small = _resized(pictures)
+        height, width = pictures.shape[1:3]
+        scale = max(min(1.0, WIDTH / width), _LEAST / min(height, width))
+        small = pictures
+        if scale != 1:
+            sides = (round(width * scale), round(height * scale))
+            how = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+            small = np.stack([cv2.resize(picture, sides, interpolation=how) for picture in pictures])
         field = flow(small[:-1], small[1:])
         # the flow is in pixels of the resized picture, whose sides may have been rounded differently
         unit = WIDTH / pictures.shape[2] * np.array(pictures.shape[2:0:-1]) / np.array(small.shape[2:0:-1])
@@ -68,19 +74,6 @@ def measure_motion(frames: Frames, timestamps: Float[np.ndarray, " N"], flow: Fl
         mean[rows] = speed.mean(1) / seconds
         high[rows] = np.percentile(speed, 95, axis=1) / seconds
     return Motion(mean, high)
-
-
-def _resized(pictures: Pictures) -> UInt8[np.ndarray, "T h w 3"]:
-    height, width = pictures.shape[1:3]
-    scale = max(min(1.0, WIDTH / width), _LEAST / min(height, width))
-    if scale == 1:
-        return pictures
-    size = (round(width * scale), round(height * scale))
-    if scale < 1:
-        how = cv2.INTER_AREA
-    else:
-        how = cv2.INTER_LINEAR
-    return np.stack([cv2.resize(picture, size, interpolation=how) for picture in pictures])
 
 
 @dataclass(frozen=True)

@@ -74,15 +74,26 @@ class BairSource:
         count = len(steps)
         if lacking := sorted(set(range(max(count, 1))) - steps):
             raise EpisodeError.at(example.where, f"has no step {lacking[0]}")
+        actions = align_actions(_rows(example, "action", count))
+        states = _rows(example, "endeffector_pos", count)
+        cameras = {}
+        for camera, key in CAMERAS.items():
+            payloads = []
+            for name in (f"{step}/{key}/encoded" for step in range(count)):
+                payloads.append(b"".join(example.blobs(name)))
+                if (size := len(payloads[-1])) != SIDE * SIDE * 3:
+                    raise EpisodeError.at(example.where, f"{name} has {size} bytes, should have {SIDE * SIDE * 3}")
+            pictures = np.frombuffer(b"".join(payloads), np.uint8).reshape(count, SIDE, SIDE, 3)
+            cameras[camera] = ArrayFrames(pictures)
         episode = Episode(
             id=ref.id,
             fingerprint=ref.fingerprint,
             task="",
             fps=self.fps,
             timestamps=np.arange(count) / self.fps,
-            actions=align_actions(_rows(example, "action", count)),
-            states=_rows(example, "endeffector_pos", count),
-            cameras={name: _frames(example, key, count) for name, key in CAMERAS.items()},
+            actions=actions,
+            states=states,
+            cameras=cameras,
             meta={"source": "bair", "file": ref.location["file"], "actions": Layout().to_json(), "fps_assumed": True},
         )
         return checked(episode, example.where)
@@ -102,12 +113,3 @@ def _rows(example: Example, key: str, count: int) -> Float32[np.ndarray, "N n"]:
         if row.shape != rows[0].shape:
             raise EpisodeError.at(example.where, f"{step}/{key} has {row.size} values, that of step 0 {rows[0].size}")
     return np.concatenate(rows)
-
-
-def _frames(example: Example, key: str, count: int) -> ArrayFrames:
-    payloads = []
-    for name in (f"{step}/{key}/encoded" for step in range(count)):
-        payloads.append(b"".join(example.blobs(name)))
-        if (size := len(payloads[-1])) != SIDE * SIDE * 3:
-            raise EpisodeError.at(example.where, f"{name} has {size} bytes, should have {SIDE * SIDE * 3}")
-    return ArrayFrames(np.frombuffer(b"".join(payloads), np.uint8).reshape(count, SIDE, SIDE, 3))
