@@ -42,6 +42,8 @@ from rsjax.trainable import Params
 
 GROUP = 8
 
+_renewed = jax.jit(renewed, static_argnums=(0, 1), donate_argnums=3)  # a program of its own, since few steps need it
+
 
 class TokenImagination:
     """Implements :class:`rsjax.models.base.Imagination`. Frames have depth if the model and its training clips have it.
@@ -196,12 +198,6 @@ def _restarted(which: Bool[Array, " B"], fresh: State, old: State) -> State:
     axes = clip_axes(old)
     stacked: State = jax.vmap(where, (0, axes, axes), axes)(which, fresh, old)
     return stacked
-
-
-@partial(jax.jit, static_argnums=(0, 1), donate_argnums=(3,))
-def _renewed(arch: Architecture, sample: SampleConfig, params: Params, state: State, full: Bool[Array, " B"]) -> State:
-    """Returns a stack of states whose full windows have moved: a program of its own, since few steps need it."""
-    return renewed(arch, sample, params, state, full)
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2, 3), donate_argnums=(6,))

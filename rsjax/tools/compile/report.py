@@ -70,7 +70,18 @@ def compile_program(program: Program, target: Target, console: Console) -> Compi
         try:
             compiled = program.lower().compile(compiler_options=options)
         except JaxRuntimeError as error:
-            raise _refusal(error, program, target) from error
+            text = str(error)
+            exceeded = re.search(r"Used ([\d.]+\w) of ([\d.]+\w) hbm", text)
+            if exceeded:
+                raise TooLargeError(
+                    f"{program.title}: needs {exceeded[1]}iB of memory on each device; {target.card.title} has "
+                    f"{exceeded[2]}iB"
+                ) from error
+            path = Path(tempfile.gettempdir()) / "rsjax-compile-error.txt"
+            write_file(path, text.encode())
+            raise UserError(
+                f"the compiler refuses this: {program.title}, for {target.name}: {first_line(error)} (all: {path})"
+            ) from error
         if target.card.platform == "tpu":
             # jax cannot read back a TPU's program in which collectives are fused with kernels, so its compiler writes.
             text = next(Path(folder).glob("*.after_codegen.txt")).read_text()
@@ -92,20 +103,6 @@ def _shown(line: str, console: Console) -> Iterator[None]:
     with Progress(*columns, console=console, transient=True) as progress:
         progress.add_task(line)
         yield
-
-
-def _refusal(error: Exception, program: Program, target: Target) -> UserError:
-    text = str(error)
-    exceeded = re.search(r"Used ([\d.]+\w) of ([\d.]+\w) hbm", text)
-    if exceeded:
-        return TooLargeError(
-            f"{program.title}: needs {exceeded[1]}iB of memory on each device; {target.card.title} has {exceeded[2]}iB"
-        )
-    path = Path(tempfile.gettempdir()) / "rsjax-compile-error.txt"
-    write_file(path, text.encode())
-    return UserError(
-        f"the compiler refuses this: {program.title}, for {target.name}: {first_line(error)} (all: {path})"
-    )
 
 
 def capacity(target: Target) -> float:

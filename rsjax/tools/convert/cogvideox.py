@@ -433,7 +433,15 @@ def embed_texts(source: Path, out: Path, tasks: Sequence[str], store: Path | Non
         UserError: the directory holds no such encoder, ``transformers`` is not installed, or there are no tasks.
     """
     replaces = check_file(out)
-    names = [EMPTY, *dict.fromkeys([*tasks, *(_tasks(store) if store else ())])]
+    stored: list[str] = []
+    if store:
+        opened = open_store(store)
+        splits = [split for split in opened.splits if opened.labelled(split)]
+        stored = [task for split in splits for task in opened.labels(split).words.get("task", ())]
+        if not splits:
+            sources = [opened.source(split) for split in opened.splits]
+            stored = [clips[number]["task"] for clips in sources for number in range(len(clips))]
+    names = [EMPTY, *dict.fromkeys([*tasks, *(task for task in stored if task != UNKNOWN)])]
     if len(names) == 1:
         raise ConvertError(f"{out}: there are no tasks to embed; name them with --task, or a store with --store")
     try:
@@ -461,13 +469,3 @@ def embed_texts(source: Path, out: Path, tasks: Sequence[str], store: Path | Non
     return [
         f"{out}: {len(names)} texts of {tokens} tokens of {embeddings.shape[2]} numbers, the empty one first{replaces}"
     ]
-
-
-def _tasks(store: Path) -> list[str]:
-    """Returns the tasks of a store's clips, in words."""
-    opened = open_store(store)
-    splits = [split for split in opened.splits if opened.labelled(split)]
-    tasks = [word for split in splits for word in opened.labels(split).words.get("task", ())]
-    if not splits:
-        tasks = [opened.source(split)[i]["task"] for split in opened.splits for i in range(len(opened.source(split)))]
-    return [task for task in dict.fromkeys(tasks) if task != UNKNOWN]

@@ -181,7 +181,14 @@ def _convert(source: Path, out: Path, heads: int | None) -> list[str]:
         model = own[0]
         actions = own[1].action_dim
     else:
-        model, actions = infer_llama(source, used, heads or _published_heads(source), names)
+        path = source.parent / SETTINGS
+        if not heads and path.exists():
+            cure = f"put the published one beside {source.name}, or delete it"
+            heads = read_json(path, cure=cure).get(HEADS)
+            check_type(path, HEADS, heads, 1)
+            if heads is not None and heads < 1:
+                raise ConvertError(f"{path}: {HEADS} is {heads}, not above 0")
+        model, actions = infer_llama(source, used, heads or None, names)
     shapes = _llama_shapes(model, actions)
     params = to_params(source, used, llama_table(model), shapes, names)
     before = saved_part(out, IVideoGPTConfig, "tokenizer")
@@ -194,18 +201,6 @@ def _convert(source: Path, out: Path, heads: int | None) -> list[str]:
     replaces = save_part(out, "world_model", whole, inputs, params)
     lines = left_aside(aside, others)
     return [f"{out}: a transformer of {len(used)} tensors, {described(model)}{REPLACES * replaces}", *lines]
-
-
-def _published_heads(weights: Path) -> int | None:
-    """Returns ``num_attention_heads`` of the settings beside a file of weights, if they say it."""
-    path = weights.parent / SETTINGS
-    if not path.exists():
-        return None
-    heads = read_json(path, cure=f"put the published one beside {weights.name}, or delete it").get(HEADS)
-    check_type(path, HEADS, heads, 1)
-    if heads is not None and heads < 1:
-        raise ConvertError(f"{path}: {HEADS} is {heads}, not above 0")
-    return heads  # type: ignore[no-any-return]
 
 
 def export(source: Path, out: Path, part: Part | None = None) -> list[str]:

@@ -102,26 +102,21 @@ def index_windows(
     parts = [np.zeros((0, config.frames), np.int64)]
     short = 0
     for first, end in spans:
-        windows = first + _windows_of(timestamps[first:end], fps, config)
+        clock = timestamps[first:end]
+        count = len(clock)
+        rate = config.rate
+        if not rate:  # as recorded
+            rate = 1.0
+            clock = np.arange(count, dtype=np.float64)
+        clock = np.append(clock, clock[-1] + (1 / fps if config.rate else 1))  # a step nearest to this end is too late
+        # Only even steps nearest to some frame start a window: a recording that stops for years has few of them.
+        numbers = np.unique(np.floor((clock - clock[0]) * rate / config.hop + 0.5 + _TIE))
+        starts = np.unique(_nearest(clock, clock[0] + numbers * config.hop / rate))
+        frames = _nearest(clock, clock[starts, None] + np.arange(config.frames) / rate)
+        windows = first + frames[frames[:, -1] < count]
         short += not len(windows)
         parts.append(windows)
     return WindowIndex(np.concatenate(parts), short)
-
-
-def _windows_of(times: Float[np.ndarray, " n"], fps: float, config: WindowConfig) -> Int[np.ndarray, "W T"]:
-    """Returns the windows of one span, as frame numbers counted from the span's first frame."""
-    count = len(times)
-    rate = config.rate
-    clock = times
-    if not rate:  # as recorded
-        rate = 1.0
-        clock = np.arange(count, dtype=np.float64)
-    clock = np.append(clock, clock[-1] + (1 / fps if config.rate else 1))  # a step nearest to this end is too late
-    # Only even steps that are nearest to some frame start a window: a recording that stops for years has few of them.
-    numbers = np.unique(np.floor((clock - clock[0]) * rate / config.hop + 0.5 + _TIE))
-    starts = np.unique(_nearest(clock, clock[0] + numbers * config.hop / rate))
-    frames = _nearest(clock, clock[starts, None] + np.arange(config.frames) / rate)
-    return frames[frames[:, -1] < count]
 
 
 def _nearest(times: Float[np.ndarray, " n"], wanted: Float[np.ndarray, "*m"]) -> Int[np.ndarray, "*m"]:

@@ -177,7 +177,15 @@ def _pack(what: Collection, partial: Path, out: Path) -> None:
     source = source_name(what.config)
     config = to_dict(what.config)
     meta = {"key": what.key, "source": source, "config": config, "quarantine": failures}
-    meta |= _units(files["train"]) if "train" in files else {}
+    if "train" in files:
+        actions = []
+        depths = []
+        for record in _clips(files["train"]):
+            depths += [float(record["depth"].min()), float(record["depth"].max())]
+            actions.append(record["actions"][1:])  # frame 0 has no action
+        flat = np.concatenate(actions).astype(np.float64)
+        meta |= {"depth_range": [min(depths), max(depths)]}
+        meta |= {"action_mean": flat.mean(0).tolist(), "action_std": flat.std(0).tolist()}
     meta |= _summary([path for paths in files.values() for path in paths]) | dict(what.meta)
     stamp = {"depth_range": meta["depth_range"]}
     splits = {
@@ -194,22 +202,6 @@ def labels(clip: Record) -> dict[str, str]:
 
 def _clips(paths: list[Path]) -> Iterator[Record]:
     return (decode(path.read_bytes()) for path in paths)
-
-
-def _units(train: list[Path]) -> dict[str, Any]:
-    """Returns manifest fields: depth range in metres, mean and standard deviation of the actions.
-
-    Frame 0 has no action.
-    """
-    actions = []
-    depths = []
-    for record in _clips(train):
-        depths += [float(record["depth"].min()), float(record["depth"].max())]
-        actions.append(record["actions"][1:])
-    flat = np.concatenate(actions).astype(np.float64)
-    mean = flat.mean(0).tolist()
-    std = flat.std(0).tolist()
-    return {"depth_range": [min(depths), max(depths)], "action_mean": mean, "action_std": std}
 
 
 def _summary(paths: list[Path]) -> dict[str, Any]:

@@ -50,27 +50,23 @@ class Driver:
 
     def act(self, state: State) -> Float[np.ndarray, " 7"]:
         """Returns the next action."""
-        if self._left == 0:
-            self._begin()
+        rng = self._rng
+        if self._left == 0:  # a new stroke: along one, two or three of the axes, or the last stroke reversed
+            if self._stroke.any() and rng.random() < REVERSES:
+                self._stroke = -self._stroke
+            else:
+                direction = np.zeros(3)
+                while not direction.any():
+                    direction = rng.integers(-1, 2, 3).astype(float)
+                self._stroke = np.append(rng.uniform(*SPEED) * direction, np.zeros(3))
+                if rng.random() < TURNS:
+                    self._stroke[5] = rng.choice([-TURN, TURN])
+            if rng.random() < GRIPS:
+                self._action[6] = CLOSE if self._action[6] == OPEN else OPEN
+            self._left = int(rng.integers(*LENGTH, endpoint=True))
         self._left -= 1
         low, high = WORKSPACE
         leaves = ((state.goal <= low) & (self._stroke[:3] < 0)) | ((state.goal >= high) & (self._stroke[:3] > 0))
         self._stroke[:3] = np.where(leaves, -self._stroke[:3], self._stroke[:3])
         self._action[:6] += SMOOTH * (self._stroke - self._action[:6])
         return self._action.copy()
-
-    def _begin(self) -> None:
-        """Draws a stroke: along one, two or three of the axes, or the last stroke reversed."""
-        rng = self._rng
-        if self._stroke.any() and rng.random() < REVERSES:
-            self._stroke = -self._stroke
-        else:
-            direction = np.zeros(3)
-            while not direction.any():
-                direction = rng.integers(-1, 2, 3).astype(float)
-            self._stroke = np.append(rng.uniform(*SPEED) * direction, np.zeros(3))
-            if rng.random() < TURNS:
-                self._stroke[5] = rng.choice([-TURN, TURN])
-        if rng.random() < GRIPS:
-            self._action[6] = CLOSE if self._action[6] == OPEN else OPEN
-        self._left = int(rng.integers(*LENGTH, endpoint=True))

@@ -118,7 +118,17 @@ class Expert:
     def act(self, state: State) -> Float[np.ndarray, " 7"]:
         """Returns the next action."""
         explores = self.manner.mode == "explore"
-        target, finger = self._wander() if explores else self._pick(state)
+        if explores:
+            # A random target over or on the table, which changes every half second or so, and a finger action.
+            if self._step >= self._until:
+                self._until = self._step + int(self._rng.integers(6, 18))
+                low = (-0.15, -0.2, TABLE_HEIGHT + 0.015)
+                self._goal = self._rng.uniform(low, (0.12, 0.2, TABLE_HEIGHT + 0.25))
+                self._finger = OPEN if self._rng.random() < 0.6 else CLOSE
+            target = self._goal
+            finger = self._finger
+        else:
+            target, finger = self._pick(state)
         action = np.zeros(7)
         action[:3] = np.clip(GAIN * (target - state.goal), -self.manner.speed, self.manner.speed)
         if not explores and self._phase in ("hover", "descend"):
@@ -156,18 +166,6 @@ class Expert:
         self._phase_step += 1
         targets = {"hover": above, "descend": grasp}
         return targets.get(self._phase, self._goal), CLOSE if self._phase in ("grasp", "carry") else OPEN
-
-    def _wander(self) -> tuple[Float[np.ndarray, " 3"], float]:
-        """Returns a random target over or on the table, which changes every half second or so, and a finger action."""
-        if self._step >= self._until:
-            self._until = self._step + int(self._rng.integers(6, 18))
-            low = (-0.15, -0.2, TABLE_HEIGHT + 0.015)
-            self._goal = self._rng.uniform(low, (0.12, 0.2, TABLE_HEIGHT + 0.25))
-            if self._rng.random() < 0.6:
-                self._finger = OPEN
-            else:
-                self._finger = CLOSE
-        return self._goal, self._finger
 
 
 def yaw_action(state: State) -> float:

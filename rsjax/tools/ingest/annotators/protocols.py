@@ -57,16 +57,17 @@ class Annotator:
 
     def params(self) -> dict[str, Any]:
         """Returns all that the output depends on, JSON-ready: files by content and not by path; no device."""
-        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self) if field.name != "device"}
-        by_content = {name: _digest(value) if isinstance(value, Path) else value for name, value in values.items()}
-        return {"name": self.name, "version": self.version} | by_content
-
-
-def _digest(path: Path) -> str:
-    if not path.is_dir():
-        return fingerprint([path])
-    kept = (file for file in path.rglob("*") if file.is_file() and not {".git", "__pycache__"} & {*file.parts})
-    return fingerprint(sorted(kept))
+        values = {"name": self.name, "version": self.version}
+        for field in (field for field in dataclasses.fields(self) if field.name != "device"):
+            value = getattr(self, field.name)
+            if isinstance(value, Path):
+                files = [value]
+                if value.is_dir():
+                    files = sorted(file for file in value.rglob("*") if file.is_file())
+                    files = [file for file in files if not {".git", "__pycache__"} & {*file.parts}]
+                value = fingerprint(files)
+            values[field.name] = value
+        return values
 
 
 @dataclass(frozen=True)
