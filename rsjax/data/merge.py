@@ -147,7 +147,13 @@ def _write_merged(stores: Sequence[Store], out: Path, key: str) -> Store:
     first = stores[0].manifest
     meta = {name: value for name, value in first.items() if name not in OF_WHOLE} | _statistics(stores)
     meta |= {"key": key, "merged": [{"path": str(one.path), "key": one.manifest.get("key")} for one in stores]}
-    meta |= {name: _left_out(stores, name) for name in LEFT_OUT if any(name in store.manifest for store in stores)}
+    for name in LEFT_OUT:
+        entries = [(store.path, entry) for store in stores for entry in (store.manifest.get(name) or {}).items()]
+        reasons: dict[str, str] = {}
+        for path, (episode, why) in entries:
+            reasons[f"{episode} ({path})" if episode in reasons else episode] = why
+        if any(name in store.manifest for store in stores):
+            meta[name] = reasons
     if all("episodes" in store.manifest for store in stores):
         meta["episodes"] = {}
         for split_name, ids in (entry for store in stores for entry in store.manifest["episodes"].items()):
@@ -173,15 +179,6 @@ def _write_merged(stores: Sequence[Store], out: Path, key: str) -> Store:
 
 def _labelled(stores: Sequence[Store]) -> bool:
     return all(store.labelled(name) for store in stores for name, count in store.counts().items() if count)
-
-
-def _left_out(stores: Sequence[Store], name: str) -> dict[str, str]:
-    """Returns the reasons in all stores, by episode; an episode that was named before also gets the store's path."""
-    reasons: dict[str, str] = {}
-    for store in stores:
-        for episode, why in (store.manifest.get(name) or {}).items():
-            reasons[f"{episode} ({store.path})" if episode in reasons else episode] = why
-    return reasons
 
 
 def _statistics(stores: Sequence[Store]) -> dict[str, Any]:

@@ -83,13 +83,6 @@ def _repeat(x: Video, times: int) -> Video:
     return jnp.concatenate([x[:, :alone], x[:, alone:].repeat(times, axis=1)], axis=1)
 
 
-def _halve(x: Video) -> Video:
-    """Averages pairs of frames; the first of an odd number stays as it is."""
-    alone = x.shape[1] % 2
-    # Not a mean over an axis of pairs: XLA would draw the convolution before it into a sum that runs on one core.
-    return jnp.concatenate([x[:, :alone], (x[:, alone::2] + x[:, alone + 1 :: 2]) / 2], axis=1)
-
-
 class CausalResBlock(nn.Module):
     """Norm → SiLU → causal convolution, twice, plus the input, through a linear layer where the width changes."""
 
@@ -128,7 +121,11 @@ class CausalEncoder(nn.Module):
                 x = CausalResBlock(width, cfg.norm_groups, dtype, name=f"down_{level}_block_{i}")(x)
             if level < last:
                 if level < TIME_LEVELS and x.shape[1] > 1:
-                    x = _halve(x)
+                    # Pairs of frames are averaged; the first of an odd number stays as it is. Not by a mean over an
+                    # axis of pairs: XLA would draw the convolution before it into a sum that runs on one core.
+                    alone = x.shape[1] % 2
+                    pairs = (x[:, alone::2] + x[:, alone + 1 :: 2]) / 2
+                    x = jnp.concatenate([x[:, :alone], pairs], axis=1)
                 x = by_frame(x, Downsample(name=f"down_{level}_downsample"))
         for i in range(2):
             x = CausalResBlock(cfg.widths[-1], cfg.norm_groups, dtype, name=f"mid_block_{i}")(x)

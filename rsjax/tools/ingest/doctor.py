@@ -390,7 +390,16 @@ def _open_check(source: EpisodeSource, limits: Thresholds) -> Callable[[tuple[in
 def _check(source: EpisodeSource, limits: Thresholds, ref: EpisodeRef) -> Checked:
     try:
         episode = source.read(ref)
-        return ref, *check_episode(episode, limits), _mended(episode)
+        problems, stats = check_episode(episode, limits)
+        repaired = []  # by the reader
+        for name, value in episode.meta.get("notes", {}).items():
+            parts = value
+            if isinstance(value, dict):
+                parts = [f"{key} {number}" for key, number in value.items()]
+            if isinstance(parts, list):
+                parts = ", ".join(map(str, parts))
+            repaired.append(f"{name.replace('_', ' ')}: {parts}")
+        return ref, problems, stats, "; ".join(repaired)
     except Exception as error:  # an error in one episode must not hide the others
         line = " ".join(str(error).split())
         kind = "unreadable"
@@ -399,18 +408,6 @@ def _check(source: EpisodeSource, limits: Thresholds, ref: EpisodeRef) -> Checke
             kind = error.kind
             detail = line
         return ref, [Finding(ref.id, kind, detail)], None, ""
-
-
-def _mended(episode: Episode) -> str:
-    """Returns the reader's notes on what it repaired."""
-    notes = []
-    for name, value in episode.meta.get("notes", {}).items():
-        if isinstance(value, dict):
-            parts = [f"{key} {number}" for key, number in value.items()]
-        else:
-            parts = value
-        notes.append(f"{name.replace('_', ' ')}: {', '.join(map(str, parts)) if isinstance(parts, list) else parts}")
-    return "; ".join(notes)
 
 
 def compare(stats: dict[str, EpisodeStats], unusual: float) -> Iterator[Finding]:

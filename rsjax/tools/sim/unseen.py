@@ -42,7 +42,17 @@ def collect_unseen(config: SimConfig, clips: Store, episodes: int, report: Repor
         f"gives {config.test_episodes}",
     )
     key = content_key("unseen", RECIPE, collection_key(config), episodes)
-    splits = {split: _plans(config, split, episodes) for split in unseen_splits(config)}
+    splits: dict[str, tuple[EpisodePlan, ...]] = {}
+    first = config.episodes - config.test_episodes
+    tasks = config.held_out_tasks
+    for split in unseen_splits(config):
+        if split in CHANGES:
+            seen = range(first, first + episodes)
+            plans = [EpisodePlan(f"{split}-{i:06d}", i, task_of(config, i), CHANGES[split]) for i in seen]
+        else:
+            new = range(config.episodes, config.episodes + episodes)
+            plans = [EpisodePlan(f"{split}-{i:06d}", i, tasks[i % len(tasks)]) for i in new]
+        splits[split] = tuple(plans)
     unseen: dict[str, dict[str, Any]] = {
         "unseen_task": {"tasks": list(config.held_out_tasks)},
         "unseen_camera": {"yaw_degrees_to_either_side": list(YAW), "pitch_degrees": list(PITCH)},
@@ -60,13 +70,3 @@ def collect_unseen(config: SimConfig, clips: Store, episodes: int, report: Repor
 def unseen_splits(config: SimConfig) -> tuple[str, ...]:
     """Returns the names of the splits of :func:`collect_unseen`."""
     return (*(("unseen_task",) if config.held_out_tasks else ()), *CHANGES)
-
-
-def _plans(config: SimConfig, split: str, episodes: int) -> tuple[EpisodePlan, ...]:
-    if split in CHANGES:
-        first = config.episodes - config.test_episodes
-        seen = range(first, first + episodes)
-        return tuple(EpisodePlan(f"{split}-{i:06d}", i, task_of(config, i), CHANGES[split]) for i in seen)
-    tasks = config.held_out_tasks
-    new = range(config.episodes, config.episodes + episodes)
-    return tuple(EpisodePlan(f"{split}-{i:06d}", i, tasks[i % len(tasks)]) for i in new)
