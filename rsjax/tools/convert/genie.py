@@ -26,24 +26,14 @@ from rsjax.tools.convert.files import (
     write_published,
 )
 from rsjax.tools.convert.sources import read_network, weights_file
-from rsjax.tools.convert.table import (
-    SAME_NAMES,
-    Entry,
-    Names,
-    Table,
-    norm,
-    shape_of,
-    to_params,
-    to_tensors,
-    weight_and_bias,
-)
+from rsjax.tools.convert.table import SAME_NAMES, Entry, Names, norm, shape_of, to_params, to_tensors, weight_and_bias
 from rsjax.trainable import Params
 
 # The only values under which the public network has the same parameters as this project's.
 FIXED = {"qkv_bias": False, "proj_bias": True, "mlp_bias": True}
 
 
-def table(config: Architecture) -> Table:
+def table(config: Architecture) -> tuple[Entry, ...]:
     """Returns an entry for each public tensor of the network.
 
     Raises:

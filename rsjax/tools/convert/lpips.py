@@ -9,13 +9,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from rsjax.tokenizers.lpips import NETS, lpips_shapes
-from rsjax.tools.convert.files import (
-    ConvertError,
-    Tensors,
-    check_file,
-    left_aside,
-    write_safetensors,
-)
+from rsjax.tools.convert.files import ConvertError, Tensors, check_file, left_aside, write_safetensors
 from rsjax.tools.convert.sources import read_network, weights_file
 from rsjax.tools.convert.table import SAME_NAMES, Names, check
 

@@ -24,17 +24,7 @@ from rsjax.tools.convert.files import (
     write_safetensors,
 )
 from rsjax.tools.convert.sources import read_network, weights_file
-from rsjax.tools.convert.table import (
-    SAME_NAMES,
-    Entry,
-    Names,
-    Table,
-    norm,
-    shape_of,
-    to_params,
-    to_tensors,
-    weight_and_bias,
-)
+from rsjax.tools.convert.table import SAME_NAMES, Entry, Names, norm, shape_of, to_params, to_tensors, weight_and_bias
 
 Weights = Literal["raw", "ema"]
 METADATA = "rsjax.tokenizer"  # key of the configuration in the metadata of an exported file
@@ -52,7 +42,7 @@ def public_name(key: str, weights: Weights) -> str:
     return f"model_ema.{key.replace('.', '')}"
 
 
-def table(config: TokenizerConfig) -> Table:
+def table(config: TokenizerConfig) -> tuple[Entry, ...]:
     """Returns an entry for each public tensor of the network, under its raw name."""
     levels = range(len(config.channel_multipliers))
     widths = [config.channels * multiplier for multiplier in config.channel_multipliers]

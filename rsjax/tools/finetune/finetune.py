@@ -8,14 +8,7 @@ from rsjax.config import Config, content_key
 from rsjax.data.store import Store, open_store
 from rsjax.progress import Progress, note
 from rsjax.tools.finetune.cost import estimate
-from rsjax.tools.finetune.recipe import (
-    FIXED_CAMERA,
-    MARGIN,
-    Finetuning,
-    finetuned,
-    measure_tokenizer,
-    moving_share,
-)
+from rsjax.tools.finetune.recipe import FIXED_CAMERA, MARGIN, Finetuning, finetuned, measure_tokenizer, moving_share
 from rsjax.tools.finetune.recordings import Cutting, Recordings, ingest_options
 from rsjax.tools.finetune.start import Source, write_start
 from rsjax.tools.ingest.ingest import count_steps, ingest, list_episodes
