@@ -57,7 +57,7 @@ class Annotator:
 
     def params(self) -> dict[str, Any]:
         """Returns all that the output depends on, JSON-ready: files by content and not by path; no device."""
-        values = {"name": self.name, "version": self.version}
+        values: dict[str, Any] = {"name": self.name, "version": self.version}
         for field in (field for field in dataclasses.fields(self) if field.name != "device"):
             value = getattr(self, field.name)
             if isinstance(value, Path):
