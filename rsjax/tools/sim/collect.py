@@ -176,7 +176,7 @@ def _pack(what: Collection, partial: Path, out: Path) -> None:
     }
     source = source_name(what.config)
     config = to_dict(what.config)
-    meta = {"key": what.key, "source": source, "config": config, "quarantine": failures}
+    meta: dict[str, Any] = {"key": what.key, "source": source, "config": config, "quarantine": failures}
     if "train" in files:
         actions = []
         depths = []
