@@ -10,7 +10,7 @@ from rsjax.progress import Progress, note
 from rsjax.tools.finetune.cost import estimate
 from rsjax.tools.finetune.recipe import FIXED_CAMERA, MARGIN, Finetuning, finetuned, measure_tokenizer, moving_share
 from rsjax.tools.finetune.recordings import Cutting, Recordings, ingest_options
-from rsjax.tools.finetune.start import Source, write_start
+from rsjax.tools.finetune.start import Source, content_of, write_start
 from rsjax.tools.ingest.ingest import count_steps, ingest, list_episodes
 from rsjax.tools.ingest.options import make_plan, make_runner
 from rsjax.tools.ingest.summary import lines
@@ -58,13 +58,13 @@ def prepare(source: Source, store: Store, settings: Finetuning, out: Path) -> Co
     start = str(folder.absolute())
     settings = settings.for_clips(source.config, len(store.source("train")))
     finetuned(source, store, start, settings, adapts=True)  # raises before anything is written
-    key = content_key("finetune", str(source.directory.absolute()), store.manifest.get("key"), settings)
+    key = content_key("finetune", content_of(source), store.manifest.get("key"), settings)
     with make_once(folder, key, refuse=OTHERS) as work:
         if not work.finished:
-            weights = write_start(source, folder)
+            write_start(source, folder)
             found = measure_tokenizer(source, store)
             adapts = settings.tokenizer == "adapt" or (settings.tokenizer == "measure" and not found.good)
-            work.save(weights=weights, adapts=adapts, **asdict(found), said=said(settings, str(found), adapts))
+            work.save(adapts=adapts, **asdict(found), said=said(settings, str(found), adapts))
     note(work.metadata["said"])
     share = moving_share(store)
     still = settings.keep_still == "on" or (settings.keep_still == "measure" and share < FIXED_CAMERA)

@@ -81,12 +81,15 @@ def find_source(name: Path | str) -> Source:
     return Source(directory, config, read_architecture(directory))
 
 
-def write_start(source: Source, folder: Path) -> str:
-    """Writes both networks, the world model's without its action encoder, as ``rsjax convert`` does.
+def content_of(source: Source) -> str:
+    """Returns a hash of a model's settings and weights, which stays the same where the model is moved to."""
+    _, tokenizer_params = converted.load_tokenizer(source.directory)
+    _, params = converted.load_world_model(source.directory)
+    return content_key(source.config, fingerprint((tokenizer_params, params)))
 
-    Returns:
-        A hash of the weights.
-    """
+
+def write_start(source: Source, folder: Path) -> None:
+    """Writes both networks, the world model's without its action encoder, as ``rsjax convert`` does."""
     tokenizer, tokenizer_params = converted.load_tokenizer(source.directory)
     _, params = converted.load_world_model(source.directory)
     without = replace(
@@ -97,7 +100,6 @@ def write_start(source: Source, folder: Path) -> str:
     )
     converted.save(folder, tokenizer, tokenizer_params)
     converted.save(folder, without, without_actions(params))
-    return content_key(fingerprint((tokenizer_params, params)))
 
 
 def without_actions(params: Params) -> Params:

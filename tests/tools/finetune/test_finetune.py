@@ -20,7 +20,7 @@ from rsjax.tools.convert.directory import load_world_model
 from rsjax.tools.finetune.finetune import finetune, make_clips, prepare
 from rsjax.tools.finetune.recipe import FIXED_CAMERA, Finetuning, Reconstruction, finetuned, moving_share
 from rsjax.tools.finetune.recordings import Cutting, Recordings, find_recordings
-from rsjax.tools.finetune.start import find_source, write_start
+from rsjax.tools.finetune.start import find_source
 from rsjax.tools.pipeline.run import Run
 from rsjax.tools.pipeline.stages import prepare as prepare_tokens
 from rsjax.tools.pipeline.stages import train_tokenizer, train_world_model
@@ -100,6 +100,17 @@ def test_another_model_or_setting_needs_another_directory(whole: Run, model: Pat
     assert "choose another --out" in str(caught.value)
 
 
+def test_a_moved_model_is_the_same_and_other_weights_are_not(whole: Run, model: Path, tmp_path: Path) -> None:
+    moved = tmp_path / "moved"
+    shutil.copytree(model, moved)
+    assert prepare(find_source(moved), open_store(whole.clips), SETTINGS, whole.directory) == whole.config
+    params = toy.world_model_params(toy.config())
+    save_weights(moved / "world_model" / "weights", jax.tree.map(lambda x: x + 1, params))
+    with pytest.raises(UserError) as caught:
+        prepare(find_source(moved), open_store(whole.clips), SETTINGS, whole.directory)
+    assert "choose another --out" in str(caught.value)
+
+
 def test_public_weights_are_taken_by_path(whole: Run, tmp_path: Path) -> None:
     cfg = toy.config()
     alone = replace(Architecture.create(cfg), depth="none", action_encoder="none", action_inputs=0)
@@ -126,6 +137,21 @@ def test_what_stands_still_is_kept_if_the_camera_does_not_move_or_by_word(whole:
     assert content_key(SETTINGS) != content_key(replace(SETTINGS, keep_still="on"))
 
 
+def test_the_rule_finds_a_camera_that_stands_still(model: Path, tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    for number in range(4):
+        frames = rng.integers(0, 256, (1, 64, 64, 3), np.uint8).repeat(7, axis=0)
+        for time in range(7):
+            frames[time, 8:24, 4 * time : 4 * time + 16] = 255  # a white square crosses the picture
+        np.savez(tmp_path / f"{number}.npz", frames=frames, actions=rng.normal(size=(7, 3)), fps=5.0)
+    source = find_source(model)
+    store = make_clips(Recordings("npz", tmp_path), CUTTING, source, tmp_path / "run")
+    assert 0 < moving_share(store) < FIXED_CAMERA
+    config = prepare(source, store, replace(SETTINGS, tokenizer="keep"), tmp_path / "run")
+    assert isinstance(config.model, RoboScapeConfig)
+    assert config.model.sample.keep_still == KeepStillConfig()
+
+
 @pytest.mark.parametrize(("psnr", "kept"), [(30.0, True), (22.0, False), (14.9, False)])
 def test_the_tokenizer_is_kept_where_it_beats_the_first_frame(psnr: float, kept: bool) -> None:
     assert Reconstruction(psnr, repeat_first=20.0).good is kept
@@ -145,4 +171,3 @@ def test_mistakes_are_one_line(model: Path, data: Path, tmp_path: Path) -> None:
             mistake()
         assert words in str(caught.value)
         assert "\n" not in str(caught.value)
-    assert write_start(find_source(model), tmp_path / "start")
