@@ -27,7 +27,7 @@ class Options:
     """Directory of the run."""
     steps: int = -1
     """Training steps of the world model at most; an early stop on held-out clips may end it before. 0: none; -1: each
-    clip 18 times, at most 1500 steps."""
+    clip 54 times, at most 1500 steps."""
     tokenizer_steps: int = -1
     """Those of the tokenizer, if it is adapted; -1: each clip 27 times, at most 600 steps."""
     tokenizer: Literal["measure", "keep", "adapt"] = "measure"
@@ -38,8 +38,8 @@ class Options:
     """Likewise, of the tokenizer."""
     short_share: float = 0.0
     """Share of the world model's steps that train on the first half of each clip, which costs half."""
-    patience: int = 3
-    """Validations in a row without a better one that end a training; a whole training has 8."""
+    patience: int = 8
+    """Validations in a row without a better one that end a training; a whole training has 8, so 3 ends many early."""
     seed: int = 0
     """Seed of both trainings."""
     keep_still: Literal["measure", "on", "off"] = "measure"

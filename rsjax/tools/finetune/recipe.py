@@ -32,7 +32,7 @@ MEASURED_CLIPS = 32
 FIXED_CAMERA = 0.5  # share of the pixels that may move by a clip's end if the camera stands still
 VALIDATIONS = 8  # of each training, at most
 LEAST_BETWEEN = 20  # steps from one to the next, since each generates videos
-EPOCHS = 18  # of the world model
+EPOCHS = 54  # of the world model
 TOKENIZER_EPOCHS = 27
 LEAST_STEPS = 100
 MOST_STEPS = 1500
@@ -63,7 +63,7 @@ class Finetuning:
     learning_rate: float = 0.5
     tokenizer_learning_rate: float = 1.0
     short_share: float = 0.0
-    patience: int = 3
+    patience: int = 8
     seed: int = 0
     keep_still: Literal["measure", "on", "off"] = later("measure")
 
