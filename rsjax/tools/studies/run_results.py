@@ -95,14 +95,23 @@ def run_tables(content: Mapping[str, Any]) -> dict[str, Table]:
 
 def _table(content: Mapping[str, Any], shown: Sequence[str], lifted: bool) -> Table:
     known = metrics()
+    runs = content["runs"]
     head = ["", *(known[name].heading for name in shown)]
     if lifted:
         head.append('"lifted" read correctly, 95 % interval')
     rows = []
     for suffix, label in ROWS.items():
-        cells = [label, *(_mean(content["runs"], f"{name}{suffix}", known[name].decimals) for name in shown)]
+        cells = [label]
+        for name in shown:
+            values = [run["metrics"][f"{name}{suffix}"] for run in runs if f"{name}{suffix}" in run["metrics"]]
+            cells.append(mean_text(spread(values), known[name].decimals) if values else "")
         if lifted:
-            cells.append(_share(content["runs"], f"{LIFTED}{suffix}"))
+            right = np.array([x for run in runs for x in run["clips"].get(f"{LIFTED}{suffix}", ())])
+            text = ""
+            if right.size:
+                share = wilson(int(right.sum()), right.size)
+                text = f"{share.value:.0%} ({share.low:.0%} … {share.high:.0%})".replace("%", " %")
+            cells.append(text)
         if any(cells[1:]):
             rows.append(cells)
     return Table(head, rows)
@@ -118,16 +127,3 @@ def about_runs(content: Mapping[str, Any]) -> str:
         f"Preset `{content['preset']}`, {len(runs)} run{'s' * (len(runs) > 1)} (seed {seeds}), {clips} held-out clips; "
         f"commit {commits}; {', '.join(content['machines'])}; {content['dates']}."
     )
-
-
-def _mean(runs: Sequence[Mapping[str, Any]], name: str, decimals: int) -> str:
-    values = [run["metrics"][name] for run in runs if name in run["metrics"]]
-    return mean_text(spread(values), decimals) if values else ""
-
-
-def _share(runs: Sequence[Mapping[str, Any]], name: str) -> str:
-    right = np.array([x for run in runs for x in run["clips"].get(name, ())])
-    if not right.size:
-        return ""
-    share = wilson(int(right.sum()), right.size)
-    return f"{share.value:.0%} ({share.low:.0%} … {share.high:.0%})".replace("%", " %")

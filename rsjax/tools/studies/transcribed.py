@@ -9,7 +9,7 @@ Its interval is the one that was printed, from resampling seeds and clips. Welch
 computed, but its test is: a comparison is decided only if the interval and Holm's p agree.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 from rsjax.evaluation.statistics import Estimate, holm, verdict
@@ -30,28 +30,23 @@ def transcribed_table(content: Mapping[str, Any]) -> Table:
     if "judge" not in content:
         return Table(head, rows)
     place = {name: head.index(name) for name in ("p", INTERVAL, "verdict")}
-    adjusted = _adjusted([_number(row[place["p"]]) for row in rows], rows, content["judge"])
+    judge = content["judge"]
+    begins = [number == 0 or (judge["family"] == "group" and bool(row[0])) for number, row in enumerate(rows)]
+    starts = [number for number, first in enumerate(begins) if first]
+    adjusted: list[float] = []
+    for start, end in zip(starts, [*starts[1:], len(rows)], strict=True):
+        family = [*(_number(row[place["p"]]) for row in rows[start:end]), *judge.get("further", ())]
+        adjusted.extend(holm(family)[: end - start].tolist())
     judged = []
     for row, p in zip(rows, adjusted, strict=True):
         low, high = (_number(bound) for bound in row[place[INTERVAL]].split(" … "))
-        lower = any(cell in content["judge"]["lower"] for cell in row)
+        lower = any(cell in judge["lower"] for cell in row)
         found = verdict(Estimate((low + high) / 2, low, high), "lower" if lower else "higher")
         cells: list[CellText] = list(row)
         cells[place["verdict"]] = found if p < SIGNIFICANT else "cannot tell"
         cells.insert(place["p"] + 1, p_text(p))
         judged.append(cells)
     return Table([*head[: place["p"] + 1], "p by Holm", *head[place["p"] + 1 :]], judged)
-
-
-def _adjusted(p: Sequence[float], rows: Sequence[Sequence[str]], judge: Mapping[str, Any]) -> list[float]:
-    """Returns Holm's p-values within each claim."""
-    begins = [number == 0 or (judge["family"] == "group" and bool(row[0])) for number, row in enumerate(rows)]
-    starts = [number for number, first in enumerate(begins) if first]
-    adjusted: list[float] = []
-    for start, end in zip(starts, [*starts[1:], len(rows)], strict=True):
-        family = [*p[start:end], *judge.get("further", ())]
-        adjusted.extend(holm(family)[: end - start].tolist())
-    return adjusted
 
 
 def _number(text: str) -> float:

@@ -89,28 +89,25 @@ def run_cell(name: str, runs: Mapping[str, Run], shared: Path, place: tuple[int,
             stage(*place, name, "finished, skipped")
             return "finished"
         stage(*place, name, f"in {run.directory}")
-        return _run_cell(run, [other for other in runs.values() if other is not run], shared, command)
-
-
-def _run_cell(run: Run, others: Sequence[Run], shared: Path, command: str) -> State:
-    failure = run.directory / ERROR
-    failure.unlink(missing_ok=True)
-    if run.finished("report"):  # but its metrics.json is gone
-        run.output("report").unlink()
-    try:
-        run.prepare(overwrite=False)
-        share(run, others, shared)
-        stages.run_all(run, command=command)
-    except Exception as error:
-        line = " ".join((str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}").split())
-        note(f"failed: {line}")
-        record = {"error": line, "time": time.strftime("%Y-%m-%d %H:%M:%S"), "traceback": traceback.format_exc()}
-        with suppress(FileError):  # on a full disk, only the terminal shows the error; the cell counts as interrupted
-            write_json(failure, record)
-        return "failed"
-    finally:
-        jax.clear_caches()  # no other cell uses this cell's compiled programs, which would accumulate
-    return "finished"
+        failure = run.directory / ERROR
+        failure.unlink(missing_ok=True)
+        if run.finished("report"):  # but its metrics.json is gone
+            run.output("report").unlink()
+        try:
+            run.prepare(overwrite=False)
+            share(run, [other for other in runs.values() if other is not run], shared)
+            stages.run_all(run, command=command)
+        except Exception as error:
+            line = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
+            line = " ".join(line.split())
+            note(f"failed: {line}")
+            record = {"error": line, "time": time.strftime("%Y-%m-%d %H:%M:%S"), "traceback": traceback.format_exc()}
+            with suppress(FileError):  # on a full disk, only the terminal shows the error; the cell is interrupted
+                write_json(failure, record)
+            return "failed"
+        finally:
+            jax.clear_caches()  # no other cell uses this cell's compiled programs, which would accumulate
+        return "finished"
 
 
 def share(run: Run, others: Sequence[Run], shared: Path) -> None:

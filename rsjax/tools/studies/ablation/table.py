@@ -125,19 +125,20 @@ def as_csv(rows: Sequence[Row]) -> str:
 
 def as_json(rows: Sequence[Row]) -> dict[str, Any]:
     """Returns the rows with all their metrics, the best rows of each column, and every cell with its state."""
+    cells = [
+        {
+            "name": result.name,
+            "seed": result.run.config.train.seed,
+            "state": result.state,
+            "reason": result.reason,
+            "metrics": dict(result.metrics),
+            "reasons": dict(result.reasons),
+        }
+        for row in rows
+        for result in row.results
+    ]
     return {
         "rows": [{"values": row.values} | {k: s._asdict() for k, s in row.spreads.items()} for row in rows],
         "best": {column.name: sorted(best(rows, column)) for column in shown_columns(rows)},
-        "cells": [_cell_json(result) for row in rows for result in row.results],
-    }
-
-
-def _cell_json(result: RunResult) -> dict[str, Any]:
-    return {
-        "name": result.name,
-        "seed": result.run.config.train.seed,
-        "state": result.state,
-        "reason": result.reason,
-        "metrics": dict(result.metrics),
-        "reasons": dict(result.reasons),
+        "cells": cells,
     }

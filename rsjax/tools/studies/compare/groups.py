@@ -88,7 +88,13 @@ def read_groups(texts: Sequence[str], label: str | None) -> list[Group]:
     for name, count in Counter(name for name, _ in named).items():
         require(count == 1, f"{count} groups are named {name}; name them: first=RUN second=RUN")
     runs = [run for _, paths in named for run in paths]
-    label = label or _common(runs)
+    if not label:
+        common = set.intersection(*(set(results_of(run)) for run in runs))
+        chosen = sorted(common - {OWN} or common)
+        commands = f"rsjax evaluate {' '.join(map(str, runs))} does, or training (evaluation/result.json)"
+        require(bool(chosen), f"no protocol has evaluated all of them; {commands}")
+        require(len(chosen) == 1, f"all of them have results of {' and of '.join(chosen)}; choose one with --protocol")
+        label = chosen[0]
     groups = []
     for name, paths in named:
         folders = tuple(_folder(run, label) for run in paths)
@@ -103,19 +109,6 @@ def results_of(run: Path) -> dict[str, Path]:
     """Returns the folders of a run's results by label; "run" is the label of its evaluation stage."""
     own = {OWN: run / "evaluation"} if (run / "evaluation" / NAME).exists() else {}
     return own | {path.parent.name: path.parent for path in sorted((run / FOLDER).glob(f"*/{NAME}"))}
-
-
-def _common(runs: Sequence[Path]) -> str:
-    """Returns the label that all runs have in common."""
-    common = set.intersection(*(set(results_of(run)) for run in runs))
-    chosen = sorted(common - {OWN} or common)
-    labels = " ".join(map(str, runs))
-    require(
-        bool(chosen),
-        f"no protocol has evaluated all of them; rsjax evaluate {labels} does, or training (evaluation/result.json)",
-    )
-    require(len(chosen) == 1, f"all of them have results of {' and of '.join(chosen)}; choose one with --protocol")
-    return chosen[0]
 
 
 def _folder(run: Path, label: str) -> Path:

@@ -53,6 +53,10 @@ def write_page(path: Path, comparison: Comparison, command: str) -> None:
     """
     notes = Footnotes()
     shown = strips(comparison)
+    charts = [_chart(comparison, metric) for metric in comparison.metrics if _lines(comparison, metric)]
+    if charts and all(contact.AXIS in result.curves for group in comparison.groups for result in group.results):
+        charts.append(_offset_chart(comparison))
+    curves = charts_svg(charts, "scores frame by frame", legend=True, height=2.3) if charts else ""
     html = (
         template_environment("rsjax.tools.studies.compare")
         .get_template("compare.html.j2")
@@ -64,7 +68,7 @@ def write_page(path: Path, comparison: Comparison, command: str) -> None:
             differences=as_html(difference_table(comparison)),
             legend=legend(comparison),
             notes=notes.texts,
-            curves=Markup(_curves(comparison)),
+            curves=Markup(curves),
             strips=[(clip.title, webp_uri(filmstrip(clip))) for clip in shown],
             command=command,
         )
@@ -83,7 +87,10 @@ def strips(comparison: Comparison) -> list[ComparedClip]:
     prompt = comparison.protocol["prompt_frames"]
     out = []
     for row, why in _chosen(comparison, reduce(np.intersect1d, [frames["rows"] for frames in kept])).items():
-        here = [_of_clip(frames, row) for frames in kept]
+        here = []
+        for frames in kept:
+            place = int(np.flatnonzero(frames["rows"] == row)[0])
+            here.append({name: videos[place] for name, videos in frames.items()})
         truth = here[0]["truth"]
         others = [(_label(g.name), frames["prediction"]) for g, frames in zip(comparison.groups, here, strict=True)]
         others.append(("first frame\nrepeated", np.repeat(truth[prompt - 1 : prompt], len(truth), axis=0)))
@@ -121,11 +128,6 @@ def _chosen(comparison: Comparison, rows: Int[np.ndarray, " n"]) -> dict[int, st
     return chosen
 
 
-def _of_clip(frames: dict[str, np.ndarray], row: int) -> dict[str, np.ndarray]:
-    place = int(np.flatnonzero(frames["rows"] == row)[0])
-    return {name: videos[place] for name, videos in frames.items()}
-
-
 def _reconstructions(comparison: Comparison, kept: Sequence[dict[str, np.ndarray]]) -> list[tuple[str, np.ndarray]]:
     """Returns the reconstructions by the groups' tokenizers, each distinct one once."""
     found: list[tuple[str, np.ndarray]] = []
@@ -139,14 +141,6 @@ def _reconstructions(comparison: Comparison, kept: Sequence[dict[str, np.ndarray
 
 def _label(name: str) -> str:
     return "\n".join(textwrap.wrap(name, LABEL, max_lines=2, placeholder="…"))
-
-
-def _curves(comparison: Comparison) -> str:
-    """Draws a chart for each metric over the predicted frames; a line is the mean over an entry's seeds."""
-    charts = [_chart(comparison, metric) for metric in comparison.metrics if _lines(comparison, metric)]
-    if charts and all(contact.AXIS in result.curves for group in comparison.groups for result in group.results):
-        charts.append(_offset_chart(comparison))
-    return charts_svg(charts, "scores frame by frame", legend=True, height=2.3) if charts else ""
 
 
 def _lines(comparison: Comparison, metric: Metric) -> list[tuple[str, np.ndarray, np.ndarray]]:
@@ -180,6 +174,8 @@ def _offset_chart(comparison: Comparison) -> Chart:
 
 
 def _chart(comparison: Comparison, metric: Metric) -> Chart:
+    """Draws a metric over the predicted frames; a line is the mean over an entry's seeds."""
+
     def draw(axes: Axes) -> None:
         for number, (label, frames, points) in enumerate(_lines(comparison, metric)):
             color = COLORS[number % len(COLORS)]

@@ -6,7 +6,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from rsjax.config import Config
 from rsjax.tools.pipeline.run import Run
 from rsjax.tools.studies.paper import budget
 from rsjax.tools.studies.paper.claim import Claim
@@ -111,7 +110,20 @@ def read_arm(claim: Claim, name: str, plan: Plan, known: Mapping[str, RunResult]
         absent=plan.absent.get((claim.name, name), ""),
         results=results,
     )
-    return _with_costs(arm, cells[0].config, finished) if finished else arm
+    if not finished:
+        return arm
+    config = cells[0].config
+    seconds = [sum(result.run.seconds(stage) for stage in ("tokenizer", "world_model")) for result in finished]
+    model, autoencoder = budget.parameters(config)
+    trained = model + autoencoder * (config.tokenizer_train.steps > 0)
+    frozen = model + autoencoder - trained
+    return replace(
+        arm,
+        parameters=f"{trained / 1e6:.2f} M" + (f", {frozen / 1e6:.2f} M frozen" if frozen else ""),
+        steps=None if config.train.curriculum else config.train.steps,
+        tflop=round(sum(budget.training_cost(config, "flops")) / 1e12, 1),
+        minutes=round(sum(seconds) / len(seconds) / 60, 1),
+    )
 
 
 def _numbers(claim: Claim, finished: Sequence[RunResult], read: ReadScores) -> dict[str, list[float | None]]:
@@ -154,18 +166,3 @@ def _scored(finished: Sequence[RunResult], source: str, score: str, metric: str,
 def rounded(value: float | None, digits: int) -> float | None:
     """Returns a number with so many significant digits; NaN stays NaN and None stays None."""
     return value if value is None or math.isnan(value) else float(f"{value:.{digits}g}")
-
-
-def _with_costs(arm: ArmScores, config: Config, finished: Sequence[RunResult]) -> ArmScores:
-    """Returns the arm with its steps, parameters, operations and mean minutes of training."""
-    seconds = [sum(result.run.seconds(stage) for stage in ("tokenizer", "world_model")) for result in finished]
-    model, autoencoder = budget.parameters(config)
-    trained = model + autoencoder * (config.tokenizer_train.steps > 0)
-    frozen = model + autoencoder - trained
-    return replace(
-        arm,
-        parameters=f"{trained / 1e6:.2f} M" + (f", {frozen / 1e6:.2f} M frozen" if frozen else ""),
-        steps=None if config.train.curriculum else config.train.steps,
-        tflop=round(sum(budget.training_cost(config, "flops")) / 1e12, 1),
-        minutes=round(sum(seconds) / len(seconds) / 60, 1),
-    )

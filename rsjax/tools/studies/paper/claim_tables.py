@@ -193,6 +193,10 @@ def _comparison(judged: Judged) -> dict[str, Any]:
     verdict = MISSING
     if judged.difference is not None:
         verdict = verdict_words(judged.verdict, compared.equal_margin, metric.unit)
+    interval = ABSENT
+    difference = judged.difference
+    if difference is not None and difference.low is not None and difference.high is not None:
+        interval = f"{difference.low:+.{digits}f} … {difference.high:+.{digits}f}"
     numbers = _numbers(judged)
     return {
         "what": f"{sides[0]} − {sides[1]}",
@@ -201,7 +205,7 @@ def _comparison(judged: Judged) -> dict[str, Any]:
         "margin": compared.margin,
         "sides": None if judged.sides is None else " / ".join(f"{side:.{digits}f}" for side in judged.sides),
         "difference": number_text(numbers["difference"], f"+.{digits}f"),
-        "interval": _interval(judged.difference, digits),
+        "interval": interval,
         "p": None if judged.p is None else p_text(judged.p),
         "published": None if judged.published is None else f"{judged.published:+.{digits}f}",
         "seeds": list(judged.seeds),
@@ -239,9 +243,3 @@ def _numbers(judged: Judged) -> dict[str, Any]:
         "equal_p": judged.equal_p,
         "published": judged.published,
     }
-
-
-def _interval(difference: Estimate | None, digits: int) -> str:
-    if difference is None or difference.low is None or difference.high is None:
-        return ABSENT
-    return f"{difference.low:+.{digits}f} … {difference.high:+.{digits}f}"

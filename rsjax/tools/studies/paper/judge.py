@@ -144,46 +144,9 @@ def judge_all(plan: Plan, runs: Mapping[str, Run]) -> list[Outcome]:
 
 
 def judge_claim(claim: Claim, arms: Sequence[ArmScores]) -> Outcome:
-    """Judges a claim by its arms' scores."""
+    """Judges a claim by its arms' scores; Holm's method adjusts the p-values of all its comparisons."""
     known = {arm.name: arm for arm in arms}
     measured = [_measure(claim, comparison, known) for comparison in claim.comparisons]
-    return Outcome(claim, tuple(arms), tuple(_decide(measured)))
-
-
-def _measure(claim: Claim, comparison: Comparison, arms: Mapping[str, ArmScores]) -> Judged:
-    """Returns a comparison with its difference, intervals and test, without a verdict."""
-    metric = metrics().get(comparison.metric) or Metric(comparison.metric, comparison.metric, "", "higher", 3)
-    better = arms[comparison.better]
-    than = arms[comparison.than]
-    judged = Judged(comparison, metric, (len(better.seeds), len(than.seeds)), _published(claim, comparison))
-    try:
-        pair = _paired(better, than, comparison)
-    except Unavailable as reason:
-        return replace(judged, reason=str(reason))
-    summarise = np.mean if metric.statistic == "mean" else np.median
-    one, other = (np.array([summarise(row) for row in rows]) for rows in (pair.a, pair.b))
-    success = comparison.metric == SUCCESS
-    resampled, inner = (_resampled(pair, level, metric.statistic, success) for level in (LEVEL, EQUAL_LEVEL))
-    judged = replace(
-        judged,
-        sides=(float(one.mean()), float(other.mean())),
-        difference=resampled,
-        resampled=resampled,
-        clips=min(map(len, pair.a)),
-    )
-    compare = paired_t if pair.own_clips else welch
-    test = compare(one, other, LEVEL)
-    inner_test = compare(one, other, EQUAL_LEVEL)
-    if test is None or inner_test is None:
-        return replace(judged, reason="one seed says nothing about others")
-    judged = replace(judged, test=test, difference=_wider(resampled, test), inner=_wider(inner, inner_test))
-    if success and not can_lose(np.stack(pair.b), -comparison.margin):
-        return replace(judged, reason="the other side succeeds too seldom for a loss of the margin to show")
-    return judged
-
-
-def _decide(measured: Sequence[Judged]) -> list[Judged]:
-    """Returns the comparisons of a claim with their verdicts; Holm's method adjusts the p-values of all of them."""
     tested = [each for each in measured if each.test is not None and not each.reason]
     margins = [each for each in tested if each.comparison.equal_margin]
     p = dict(zip(map(id, tested), holm([each.test.p_of(each.shift) for each in tested]), strict=True))  # type: ignore[union-attr]
@@ -197,6 +160,42 @@ def _decide(measured: Sequence[Judged]) -> list[Judged]:
             each = replace(each, p=adjusted, equal_p=beside)
             each = replace(each, verdict=_verdict(each))
         judged.append(each)
+    return Outcome(claim, tuple(arms), tuple(judged))
+
+
+def _measure(claim: Claim, comparison: Comparison, arms: Mapping[str, ArmScores]) -> Judged:
+    """Returns a comparison with its difference, intervals and test, without a verdict."""
+    metric = metrics().get(comparison.metric) or Metric(comparison.metric, comparison.metric, "", "higher", 3)
+    better = arms[comparison.better]
+    than = arms[comparison.than]
+    one, other = (claim.arm(name).published for name in (comparison.better, comparison.than))
+    score = comparison.score or comparison.metric
+    than_score = comparison.than_score or comparison.metric
+    published = one[score] - other[than_score] if score in one and than_score in other else None
+    judged = Judged(comparison, metric, (len(better.seeds), len(than.seeds)), published)
+    try:
+        pair = _paired(better, than, comparison)
+    except Unavailable as reason:
+        return replace(judged, reason=str(reason))
+    summarise = np.mean if metric.statistic == "mean" else np.median
+    a, b = (np.array([summarise(row) for row in rows]) for rows in (pair.a, pair.b))
+    success = comparison.metric == SUCCESS
+    resampled, inner = (_resampled(pair, level, metric.statistic, success) for level in (LEVEL, EQUAL_LEVEL))
+    judged = replace(
+        judged,
+        sides=(float(a.mean()), float(b.mean())),
+        difference=resampled,
+        resampled=resampled,
+        clips=min(map(len, pair.a)),
+    )
+    compare = paired_t if pair.own_clips else welch
+    test = compare(a, b, LEVEL)
+    inner_test = compare(a, b, EQUAL_LEVEL)
+    if test is None or inner_test is None:
+        return replace(judged, reason="one seed says nothing about others")
+    judged = replace(judged, test=test, difference=_wider(resampled, test), inner=_wider(inner, inner_test))
+    if success and not can_lose(np.stack(pair.b), -comparison.margin):
+        return replace(judged, reason="the other side succeeds too seldom for a loss of the margin to show")
     return judged
 
 
@@ -275,13 +274,6 @@ def _scores(arm: ArmScores, score: str, comparison: Comparison) -> Rows:
     if scored.reason:
         raise Unavailable(f"{arm.name}: {scored.reason}")
     return [np.asarray(row, float) for row in scored.rows]
-
-
-def _published(claim: Claim, comparison: Comparison) -> float | None:
-    better, than = (claim.arm(name).published for name in (comparison.better, comparison.than))
-    score = comparison.score or comparison.metric
-    other = comparison.than_score or comparison.metric
-    return better[score] - than[other] if score in better and other in than else None
 
 
 def _wider(interval: Estimate, test: TTest) -> Estimate:

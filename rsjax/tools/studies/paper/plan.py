@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from rsjax.config import ComponentConfig, Config, ConfigError, CurriculumStageConfig, SimConfig, metaworld, presets
+from rsjax.config import ComponentConfig, Config, ConfigError, CurriculumStageConfig, metaworld, presets
 from rsjax.config.config_fields import config_fields, with_values
 from rsjax.config.sim import EXPERT
 from rsjax.tools.pipeline.run import Run
@@ -82,7 +82,8 @@ def make_plan(
 ) -> Plan:
     """Returns the cells of claims, which share the budget, and the tasks in their order.
 
-    The sizes of the cells depend only on the budget, not on the claims.
+    The sizes of the cells depend only on the budget, not on the claims. Claims of rank 0 come first, with all seeds,
+    then the others with ``VERDICT_SEEDS``, then further seeds.
 
     Args:
         data: the directory of simulated data sets.
@@ -93,7 +94,16 @@ def make_plan(
     cells: dict[str, Cell] = {}  # by content key
     tasks: dict[tuple[str, str], Task] = {}
     made = set[str]()
-    for claim, arm, seed in _ordered(claims, range(seeds)):
+    first = [claim for claim in claims if not claim.rank]
+    others = [claim for claim in claims if claim.rank]
+    few = range(seeds)[:VERDICT_SEEDS]
+    more = range(seeds)[VERDICT_SEEDS:]
+    ordered = [
+        *((claim, arm, seed) for claim in first for seed in range(seeds) for arm in claim.arms),
+        *((claim, arm, seed) for claim in others for seed in few for arm in claim.arms),
+        *((claim, arm, seed) for seed in more for claim in others for arm in claim.arms),
+    ]
+    for claim, arm, seed in ordered:
         try:
             config = arm_config(arm, scale, seed, vary)
         except ConfigError as error:
@@ -137,19 +147,6 @@ def _new_seconds(config: Config, keys: Mapping[str, str], made: set[str]) -> flo
     return sum(parts[stage](config) for stage in new)
 
 
-def _ordered(claims: Sequence[Claim], seeds: range) -> list[tuple[Claim, Arm, int]]:
-    """Returns (claim, arm, seed) in order: rank 0 with all seeds; the others with ``VERDICT_SEEDS``; further seeds."""
-    first = [claim for claim in claims if not claim.rank]
-    others = [claim for claim in claims if claim.rank]
-    few = seeds[:VERDICT_SEEDS]
-    more = seeds[VERDICT_SEEDS:]
-    return [
-        *((claim, arm, seed) for claim in first for seed in seeds for arm in claim.arms),
-        *((claim, arm, seed) for claim in others for seed in few for arm in claim.arms),
-        *((claim, arm, seed) for seed in more for claim in others for arm in claim.arms),
-    ]
-
-
 def _label(arm: Arm) -> dict[str, Value]:
     """Returns the values that an arm varies, for the name of its directory."""
     family = {"model": arm.model or arm.preset} if arm.model or arm.preset else {}
@@ -173,7 +170,11 @@ def arm_config(arm: Arm, scale: Scale, seed: int, vary: Vary = "model") -> Confi
     base = scale.base
     config = base
     if arm.preset:
-        config = _small(arm, base)
+        name = f"{arm.preset}_tiny"
+        if name not in presets.PRESETS:
+            raise ConfigError(f"there is no preset {name} in this version")
+        config = replace(presets.get(name), **{field: getattr(base, field) for field in KEPT})
+        config = replace(config, model=config.model.for_tasks(base.sim.train_tasks))
     elif arm.model:
         config = base.with_family(arm.model)
     try:
@@ -183,36 +184,18 @@ def arm_config(arm: Arm, scale: Scale, seed: int, vary: Vary = "model") -> Confi
     except (AttributeError, TypeError) as error:
         raise ConfigError(f"the preset {config.name} has no such field ({error})") from error
     if arm.equal != "steps":
-        config = _equal(config, base, arm.equal, alone=bool(arm.preset))
+        tokenizer, model = budget.training_cost(config, arm.equal)
+        whole = sum(budget.training_cost(base, arm.equal))
+        if arm.preset:  # the autoencoder is its own, so that its training is scaled too
+            config = budget.cut(config, whole / (tokenizer + model))
+        else:
+            steps = round(config.train.steps * (whole - tokenizer) / model) if model else config.train.steps
+            config = budget.with_steps(config, steps)
     if arm.rate != 1:
         rate = float(f"{arm.rate * config.train.optimizer.learning_rate:.2g}")
         config = with_values(config, {"train.optimizer.learning_rate": rate})
     stages = _stages(arm, config)
     return with_values(config, {"train.curriculum": stages}) if stages else config
-
-
-def _equal(config: Config, base: Config, unit: Literal["seconds", "flops"], alone: bool) -> Config:
-    """Returns a configuration whose trainings take as much as the base preset's.
-
-    Args:
-        alone: whether the autoencoder is its own, so that its training is scaled too; otherwise it is the base
-            preset's.
-    """
-    tokenizer, model = budget.training_cost(config, unit)
-    whole = sum(budget.training_cost(base, unit))
-    if alone:
-        return budget.cut(config, whole / (tokenizer + model))
-    steps = round(config.train.steps * (whole - tokenizer) / model) if model else config.train.steps
-    return budget.with_steps(config, steps)
-
-
-def _small(arm: Arm, base: Config) -> Config:
-    """Returns the small preset of an arm's family, with the base preset's clips and evaluation."""
-    name = f"{arm.preset}_tiny"
-    if name not in presets.PRESETS:
-        raise ConfigError(f"there is no preset {name} in this version")
-    config = replace(presets.get(name), **{field: getattr(base, field) for field in KEPT})
-    return replace(config, model=config.model.for_tasks(base.sim.train_tasks))
 
 
 def _stages(arm: Arm, config: Config) -> tuple[CurriculumStageConfig, ...]:
@@ -226,7 +209,12 @@ def _stages(arm: Arm, config: Config) -> tuple[CurriculumStageConfig, ...]:
         return (CurriculumStageConfig((ComponentConfig(clips=some),), drawn / some),)
     if not arm.curriculum:
         return ()
-    simple = _simple_share(config.sim)
+    sim = config.sim
+    if sim.env == "metaworld":  # the tasks take turns
+        simple = sum(task in metaworld.SIMPLE for task in sim.train_tasks) / len(sim.train_tasks)
+    else:
+        environment = ENVIRONMENTS[sim.env]
+        simple = sim.shares.get(EXPERT, 0.0) * sum(environment.modes[mode] for mode in environment.simple)
     expected = {"simple": simple * clips, "difficult": (1 - simple) * clips}
     read = {name: epochs * expected[name] for name, epochs in arm.curriculum.items()}
     factor = drawn / sum(read.values())
@@ -237,12 +225,3 @@ def _stages(arm: Arm, config: Config) -> tuple[CurriculumStageConfig, ...]:
         CurriculumStageConfig((ComponentConfig(difficulties=(name,)),), epochs * factor)
         for name, epochs in arm.curriculum.items()
     )
-
-
-def _simple_share(sim: SimConfig) -> float:
-    """Returns the expected share of simple clips, from the tasks, which take turns, or the modes of the expert."""
-    tasks = sim.train_tasks
-    if sim.env == "metaworld":
-        return sum(task in metaworld.SIMPLE for task in tasks) / len(tasks)
-    environment = ENVIRONMENTS[sim.env]
-    return sim.shares.get(EXPERT, 0.0) * sum(environment.modes[mode] for mode in environment.simple)

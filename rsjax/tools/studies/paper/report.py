@@ -43,7 +43,13 @@ def write_report(out: Path, plan: Plan, outcomes: Sequence[Outcome], command: st
         "claims": [claim_content(each) for each in outcomes],
     }
     tables = [claim_tables(claim) for claim in content["claims"]]
-    overview = _overview(content["claims"])
+    rows = []
+    for claim in content["claims"]:
+        counts = list(claim["counts"].values())
+        missing = len(claim["comparisons"]) - sum(counts)
+        rows.append([claim["title"], claim["place"], marked(claim["verdict"]), *map(str, counts), str(missing)])
+    head = ["claim", "place", "verdict", "comparisons: hold", "do not", "are equal", "cannot tell", "not measured"]
+    overview = Table(head, rows)
     environment = template_environment("rsjax.tools.studies.paper")
     environment.autoescape = lambda name: bool(name) and "html" in str(name)
     with disk_guard(out):
@@ -97,17 +103,6 @@ def _summary(plan: Plan, outcomes: Sequence[Outcome]) -> dict[str, Any]:
         },
         "left_out": [f"{task.cell}: {task.measurement}" if task.measurement else task.cell for task in plan.left_out],
     }
-
-
-def _overview(claims: Sequence[dict[str, Any]]) -> Table:
-    """Makes a row for each claim: its verdict, and how many of its comparisons have which."""
-    rows = []
-    for claim in claims:
-        counts = list(claim["counts"].values())
-        missing = len(claim["comparisons"]) - sum(counts)
-        rows.append([claim["title"], claim["place"], marked(claim["verdict"]), *map(str, counts), str(missing)])
-    head = ["claim", "place", "verdict", "comparisons: hold", "do not", "are equal", "cannot tell", "not measured"]
-    return Table(head, rows)
 
 
 def _strip(outcome: Outcome) -> UInt8[np.ndarray, "h w 3"] | None:

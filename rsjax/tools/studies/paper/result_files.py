@@ -38,7 +38,8 @@ def write_result(path: Path, outcome: Outcome, about: Mapping[str, Any], most: i
         FileError: the disk is full.
     """
     claim = outcome.claim
-    content: dict[str, Any] = {"kind": KIND, **about, **provenance([run for arm in outcome.arms for run in _runs(arm)])}
+    runs = [result.run for arm in outcome.arms for result in arm.finished]
+    content: dict[str, Any] = {"kind": KIND, **about, **provenance(runs)}
     content["claim"] = {name: getattr(claim, name) for name in OF_CLAIM}
     content["claim"]["comparisons"] = [asdict(each) for each in claim.comparisons]
     content["arms"] = [_arm_content(arm, claim.arm(arm.name)) for arm in outcome.arms]
@@ -112,10 +113,6 @@ def provenance(runs: Sequence[Run]) -> dict[str, Any]:
         "machines": list(dict.fromkeys(machines)),
         "dates": " to ".join(dict.fromkeys([*days[:1], *days[-1:]])),
     }
-
-
-def _runs(arm: ArmScores) -> list[Run]:
-    return [result.run for result in arm.finished]
 
 
 def _arm_content(arm: ArmScores, of_claim: Arm) -> dict[str, Any]:

@@ -75,7 +75,15 @@ def print_plan(plan: Plan, out: Path, data: Path) -> None:
     )
     for (claim, arm), reason in plan.absent.items():
         print(f"{claim}: {arm} is left out: {reason}")
-    states = {task: _state(task, runs[task.cell]) for task in plan.tasks}
+    states: dict[Task, State] = {}
+    for task in plan.tasks:
+        run = runs[task.cell]
+        if not task.measurement:
+            states[task] = read_run(run).state
+        elif measured(run, task.measurement):
+            states[task] = "finished"
+        else:
+            states[task] = "missing"
     for task, state in states.items():
         what = f"{task.cell}: {task.measurement}" if task.measurement else task.cell
         print(f"{task.seconds / 60:6.1f} min  {state:11}  {what}  ({task.claim})")
@@ -84,9 +92,3 @@ def print_plan(plan: Plan, out: Path, data: Path) -> None:
     print(f"{len(plan.tasks)} tasks ({counts}), about {duration(left)} to go at the speed of 2 cores of an AMD EPYC")
     if plan.left_out:
         print(f"{len(plan.left_out)} more need a larger --budget")
-
-
-def _state(task: Task, run: Run) -> State:
-    if not task.measurement:
-        return read_run(run).state
-    return "finished" if measured(run, task.measurement) else "missing"

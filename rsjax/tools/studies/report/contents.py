@@ -47,7 +47,12 @@ def describe(store: Store, most: int = 200) -> tuple[list[str], list[str]]:
         deep += record.get("depth") is not None
     manifest = store.manifest
     episodes = {split: len(ids) for split, ids in (manifest.get("episodes") or {}).items()}
-    named = _dimensions(manifest)
+    figures = zip((manifest.get("action_mean") or []), (manifest.get("action_std") or []), strict=False)
+    units = [f"{mean:.3g}±{std:.2g}" for mean, std in figures]
+    named = [("mean±std", ", ".join(units))]  # one line for all dimensions if their names are not known
+    names = manifest.get("action_dimensions") or []
+    if len(names) == len(units):
+        named = [(f"action {place}", f"{name} {units[place]}") for place, name in enumerate(names)]
     lines = [("splits", _counted(store.counts()))]
     lines += [("tokens", f"{key}: {_counted(tokens.counts())}") for key, tokens in token_sets(store).items()]
     lines += [
@@ -58,7 +63,11 @@ def describe(store: Store, most: int = 200) -> tuple[list[str], list[str]]:
     lines += [("rate", f"{rate} {count}×") for rate, count in rates.items()]
     if not damaged:
         lines += [(name, shape) for name, shape in store.shapes().items() if shape != NO_ARRAY]
-    lines.append(("actions", _ranges(actions)))
+    if rows := [one for one in actions if one.size]:
+        low = min(one.min() for one in rows)
+        high = max(one.max() for one in rows)
+        mean = sum(float(one.sum()) for one in rows) / sum(one.size for one in rows)
+        lines.append(("actions", f"{rows[0].shape[-1]} dimensions, {low:.3g} to {high:.3g}, mean {mean:.3g}"))
     if len(named) <= MOST_DIMENSIONS:
         lines += named
     lines += [
@@ -68,7 +77,7 @@ def describe(store: Store, most: int = 200) -> tuple[list[str], list[str]]:
     ]
     if speeds:
         lines.append(("motion", histogram(speeds, MOTION_UNIT)))
-    lines += [(column, _ranked(words)) for column, words in _words(store).items()]
+    lines += _labels(store)
     lines += [("damaged", message) for message in damaged]
     return [f"{name:<9} {text}" for name, text in lines if text], damaged
 
@@ -154,42 +163,19 @@ def _rate(provenance: Mapping[str, Any]) -> list[str]:
     return [f"{fps:.4g} fps, every {every} ({fps / step:.3g} Hz)"]
 
 
-def _dimensions(manifest: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Returns a line for each dimension of the actions if their names are known, otherwise one line for all."""
-    figures = zip((manifest.get("action_mean") or []), (manifest.get("action_std") or []), strict=False)
-    units = [f"{mean:.3g}±{std:.2g}" for mean, std in figures]
-    names = manifest.get("action_dimensions") or []
-    if len(names) != len(units):
-        return [("mean±std", ", ".join(units))]
-    return [(f"action {place}", f"{name} {unit}") for place, (name, unit) in enumerate(zip(names, units, strict=True))]
-
-
-def _ranges(actions: Sequence[np.ndarray]) -> str:
-    """Returns the number of dimensions and the least, greatest and mean value of some clips' actions, as text."""
-    rows = [one for one in actions if one.size]
-    if not rows:
-        return ""
-    low = min(one.min() for one in rows)
-    high = max(one.max() for one in rows)
-    mean = sum(float(one.sum()) for one in rows) / sum(one.size for one in rows)
-    return f"{rows[0].shape[-1]} dimensions, {low:.3g} to {high:.3g}, mean {mean:.3g}"
-
-
-def _words(store: Store) -> dict[str, Counter[str]]:
-    """Returns, for each column of labels, the number of records with each label, over all splits."""
+def _labels(store: Store) -> list[tuple[str, str]]:
+    """Returns, for each column of labels, the most frequent labels over all splits with their numbers of records."""
     words: dict[str, Counter[str]] = {}
-    for name in filter(store.labelled, store.splits):
-        for column, counts in store.labels(name).counts().items():
+    for split in filter(store.labelled, store.splits):
+        for column, counts in store.labels(split).counts().items():
             words.setdefault(column, Counter()).update(counts)
-    return words
-
-
-def _ranked(words: Counter[str]) -> str:
-    more = len(words) - MOST_WORDS
-    shown = [f"{word!r} {count}×" for word, count in words.most_common(MOST_WORDS)]
-    if more > 0:
-        shown.append(f"{more} more")
-    return ", ".join(shown)
+    lines = []
+    for column, counted in words.items():
+        shown = [f"{word!r} {count}×" for word, count in counted.most_common(MOST_WORDS)]
+        if len(counted) > MOST_WORDS:
+            shown.append(f"{len(counted) - MOST_WORDS} more")
+        lines.append((column, ", ".join(shown)))
+    return lines
 
 
 def _counted(numbers: Mapping[str, int]) -> str:

@@ -108,6 +108,15 @@ def write_report(path: Path, report: RunReport) -> None:
     uncolumned = [metric for metric in metrics().values() if not (metric.column or metric.name in _APART)]
     further = [metric for metric in uncolumned if not metric.name.startswith(("depth_", "state_", "coverage"))]
     states = [metric for metric in uncolumned if metric.name.startswith("state_")]
+    clips = [
+        {
+            "title": clip.title,
+            "filmstrip": webp_uri(filmstrip(clip)),
+            "keypoints": None if clip.tracks is None else webp_uri(keypoints(clip)),
+            "depth_range": clip.depth_range() if clip.has_depth() else None,
+        }
+        for clip in report.clips
+    ]
     notes = Footnotes()
     html = environment.get_template("page.html.j2").render(
         report=report,
@@ -115,7 +124,7 @@ def write_report(path: Path, report: RunReport) -> None:
         gallery={"rate": _FPS, "clips": [player_clip(clip) for clip in report.clips]},
         player_script=Markup(player_script()),
         player_style=Markup(player_style()),
-        clips=[_clip_pictures(clip) for clip in report.clips],
+        clips=clips,
         scores=_table(report, "test clips", notes, _SCORE_ROWS, _columns(scored)),
         depths=_table(report, "depth of the prediction", notes, _DEPTH_ROWS, _DEPTH_COLUMNS),
         further=_table(report, "test clips", notes, _SCORE_ROWS, _columns(further)),
@@ -153,20 +162,13 @@ def _columns(shown: Iterable[Metric]) -> list[Column]:
     return [(f"{metric.name}{{}}", metric.heading, metric.decimals) for metric in shown]
 
 
-def _clip_pictures(clip: ClipFigure) -> dict[str, Any]:
-    has_depth = clip.true_depth is not None or clip.predicted_depth is not None
-    return {
-        "title": clip.title,
-        "filmstrip": webp_uri(filmstrip(clip)),
-        "keypoints": None if clip.tracks is None else webp_uri(keypoints(clip)),
-        "depth_range": clip.depth_range() if has_depth else None,
-    }
-
-
 def _table(
     report: RunReport, corner: str, notes: Footnotes, rows: Sequence[Row], columns: Sequence[Column]
 ) -> Markup | None:
-    """Returns a table of the rows and columns that have a metric or a reason; None without any metric."""
+    """Returns a table of the rows and columns that have a metric or a reason; None without any metric.
+
+    A cell has a score with its interval as the remark, or the footnote that says why the score is absent.
+    """
     if not any(key.format(suffix) in report.metrics for key, _, _ in columns for suffix, _ in rows):
         return None
     known = {*report.metrics, *report.reasons}
@@ -174,21 +176,20 @@ def _table(
     rows = [row for row in rows if any(key.format(row[0]) in known for key, _, _ in columns)]
     lines: list[list[CellText]] = []
     for suffix, label in rows:
-        lines.append([label, *(_cell(report, notes, key, suffix, digits) for key, _, digits in columns)])
+        cells: list[CellText] = [label]
+        for key, _, digits in columns:
+            name = key.format(suffix)
+            value = report.metrics.get(name)
+            low = report.metrics.get(f"{name}_low")
+            high = report.metrics.get(f"{name}_high")
+            if value is None:
+                cells.append(Marked(notes.absent(report.reasons.get(name) or report.reasons.get(key.format("")))))
+            elif low is None or high is None:
+                cells.append(Marked(f"{value:.{digits}f}"))
+            else:
+                cells.append(Marked(f"{value:.{digits}f}", remark=f"{low:.{digits}f} – {high:.{digits}f}"))
+        lines.append(cells)
     return as_html(Table([corner, *(header for _, header, _ in columns)], lines, first_bold=True))
-
-
-def _cell(report: RunReport, notes: Footnotes, key: str, suffix: str, digits: int) -> Marked:
-    """Returns a score with its interval as the remark, or the footnote that says why it is absent."""
-    name = key.format(suffix)
-    value = report.metrics.get(name)
-    if value is None:
-        return Marked(notes.absent(report.reasons.get(name) or report.reasons.get(key.format(""))))
-    low = report.metrics.get(f"{name}_low")
-    high = report.metrics.get(f"{name}_high")
-    if low is None or high is None:
-        return Marked(f"{value:.{digits}f}")
-    return Marked(f"{value:.{digits}f}", remark=f"{low:.{digits}f} – {high:.{digits}f}")
 
 
 def _coverage(report: RunReport) -> Markup | None:

@@ -36,9 +36,27 @@ def player_style() -> str:
 
 
 def player_clip(clip: ClipFigure) -> dict[str, Any]:
-    """Returns the data that ``gallery.js`` needs for a clip: videos as pictures of tiles, and each frame's PSNR."""
+    """Returns the data that ``gallery.js`` needs for a clip: videos as pictures of tiles, and each frame's PSNR.
+
+    A prompt frame has no PSNR (None).
+    """
     rows = {label.replace("\n", " "): frames for label, frames in clip.rows()}
-    generated = {name: frames for name, frames in rows.items() if name != "truth" and not name.endswith("depth")}
+    scores = []
+    for name, frames in rows.items():
+        if name != "truth" and not name.endswith("depth"):
+            decibels = enumerate(np.asarray(psnr(clip.truth, frames)))
+            values = [None if t < clip.prompt_frames else round(float(each), 2) for t, each in decibels]
+            scores.append({"name": name, "values": values})
+    depth: dict[str, Any] | None = None
+    if clip.has_depth():
+        near, far = clip.depth_range()
+        colors = depth_to_colors(1 / np.linspace(1 / near, 1 / far, _COLORS), near, far)
+        unit = " m" if clip.depth_unit == "metres" else ""
+        depth = {
+            "near": f"{near:.3g}{unit}",
+            "far": f"{far:.3g}{unit or ' (no unit)'}",
+            "colors": [f"#{red:02x}{green:02x}{blue:02x}" for red, green, blue in colors],
+        }
     return {
         "title": clip.title,
         "label": clip.label or clip.title,
@@ -49,27 +67,10 @@ def player_clip(clip: ClipFigure) -> dict[str, Any]:
             {"label": name, "uri": sprite_uri(rows[name]), "narrow": _place(name, _NARROW)}
             for name in sorted(rows, key=lambda name: _place(name, _WIDE))
         ],
-        "psnr": [{"name": name, "values": _psnr(clip, frames)} for name, frames in generated.items()],
-        "depth": _depth_scale(clip) if clip.has_depth() else None,
+        "psnr": scores,
+        "depth": depth,
     }
 
 
 def _place(name: str, order: Sequence[str]) -> int:
     return order.index(name) if name in order else len(order)
-
-
-def _psnr(clip: ClipFigure, frames: np.ndarray) -> list[float | None]:
-    """Returns the PSNR of each frame in dB; None for prompt frames."""
-    scores = np.asarray(psnr(clip.truth, frames))
-    return [None if t < clip.prompt_frames else round(float(score), 2) for t, score in enumerate(scores)]
-
-
-def _depth_scale(clip: ClipFigure) -> dict[str, Any]:
-    near, far = clip.depth_range()
-    colors = depth_to_colors(1 / np.linspace(1 / near, 1 / far, _COLORS), near, far)
-    unit = " m" if clip.depth_unit == "metres" else ""
-    return {
-        "near": f"{near:.3g}{unit}",
-        "far": f"{far:.3g}{unit or ' (no unit)'}",
-        "colors": [f"#{red:02x}{green:02x}{blue:02x}" for red, green, blue in colors],
-    }

@@ -2,8 +2,6 @@
 
 import os
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +41,7 @@ def rerun_view(store: Store, clips: int = 4, file: Path | None = None) -> list[s
     damaged = list[str]()
     shown = 0
     recording = rerun.RecordingStream("rsjax")
-    with _reported(file):
+    try:
         for _, _, record in clips_of(store, clips, damaged):
             if not shown:
                 _spawn(recording) if file is None else recording.save(file)
@@ -51,20 +49,13 @@ def rerun_view(store: Store, clips: int = 4, file: Path | None = None) -> list[s
             shown += 1
         recording.flush()
         recording.disconnect()
-    return damaged
-
-
-@contextmanager
-def _reported(file: Path | None) -> Iterator[None]:
-    """Turns the errors of Rerun's viewer and of its file into a :class:`UserError`."""
-    try:
-        yield
-    except (OSError, RuntimeError) as error:
+    except (OSError, RuntimeError) as error:  # of Rerun's viewer, or of its file
         reason = first_line(error)
         if file is None:
             cure = "it needs a screen; write a file for one elsewhere with --rerun-file"
             raise UserError(f"the Rerun viewer does not answer ({reason}); {cure}") from error
         raise UserError(f"{file}: cannot be written ({reason}); choose another place") from error
+    return damaged
 
 
 def _spawn(recording: Any) -> None:

@@ -44,7 +44,12 @@ def sheet_rows(store: Store, clips: int = 12, frames: int = 8, side: int = 96) -
 
 def sheet_picture(rows: Sequence[Captioned]) -> UInt8[np.ndarray, "h w 3"]:
     """Returns one picture of all rows, each below its caption, which is cut off at the picture's width."""
-    return np.concatenate([part for text, row in rows for part in (_caption(text, row.shape[1]), row)])
+    parts = []
+    for text, row in rows:
+        strip = Image.new("RGB", (row.shape[1], CAPTION), (BACKGROUND,) * 3)
+        ImageDraw.Draw(strip).text((GAP, CAPTION - 5), text, fill=(230, 230, 230), font=font(12, text), anchor="ls")
+        parts += [np.asarray(strip), row]
+    return np.concatenate(parts)
 
 
 def sheet_page(rows: Sequence[Captioned], title: str) -> str:
@@ -63,9 +68,3 @@ def _row(pictures: UInt8[np.ndarray, "n H W 3"], side: int) -> UInt8[np.ndarray,
     small = [cv2.resize(picture, (side, height), interpolation=cv2.INTER_AREA) for picture in pictures]
     framed = [np.pad(one, ((0, GAP), (0, GAP), (0, 0)), constant_values=BACKGROUND) for one in small]
     return np.concatenate(framed, axis=1)
-
-
-def _caption(text: str, width: int) -> UInt8[np.ndarray, "h w 3"]:
-    strip = Image.new("RGB", (width, CAPTION), (BACKGROUND,) * 3)
-    ImageDraw.Draw(strip).text((GAP, CAPTION - 5), text, fill=(230, 230, 230), font=font(12, text), anchor="ls")
-    return np.asarray(strip)

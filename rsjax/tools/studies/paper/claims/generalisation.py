@@ -2,6 +2,7 @@
 
 import shutil
 from dataclasses import replace
+from functools import partial
 
 from rsjax.config import Config
 from rsjax.data.store import Store, open_store
@@ -35,11 +36,7 @@ def _by_protocol(run: Run, name: str, store: Store, split: str, draws: int) -> S
     return result.per_clip
 
 
-def _long_seconds(config: Config) -> float:
-    return budget.evaluation_seconds(config, draws=0, frames=HORIZON)
-
-
-@measurement("48 frames", _long_seconds)
+@measurement("48 frames", partial(budget.evaluation_seconds, draws=0, frames=HORIZON))
 def rollouts(run: Run) -> Scores:
     """Scores rollouts of 48 predicted frames, on longer episodes of another seed."""
     longer = longer_episodes(run.config.sim, HORIZON + 1, run.config.eval.clips)
