@@ -340,18 +340,13 @@ def _parse(parts: dict[str, Any], argv: Sequence[str], prog: str, description: s
         parsed = parsed[0]
     if "options" in parts:
         check_numbers(parsed.options, "--", dash=True)
-        _check_places(parsed.options)
+        hints = get_type_hints(type(parsed.options), include_extras=True)
+        for field in dataclasses.fields(parsed.options):  # directories and files that the command will write
+            path = getattr(parsed.options, field.name)
+            named = field.name in PLACES and tyro.conf.Positional not in get_args(hints[field.name])
+            if named and isinstance(path, Path) and path != field.default:
+                check_place(path, f"--{_flag(field.name)}", PLACES[field.name] == "directory")
     return parsed
-
-
-def _check_places(options: Any) -> None:
-    """Checks the directories and files that options name for what a command will write."""
-    hints = get_type_hints(type(options), include_extras=True)
-    for field in dataclasses.fields(options):
-        path = getattr(options, field.name)
-        named = field.name in PLACES and tyro.conf.Positional not in get_args(hints[field.name])
-        if named and isinstance(path, Path) and path != field.default:
-            check_place(path, f"--{_flag(field.name)}", PLACES[field.name] == "directory")
 
 
 def _one_line(report: str, parts: dict[str, Any]) -> str:

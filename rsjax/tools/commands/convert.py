@@ -103,9 +103,16 @@ def main(argv: Sequence[str] | None = None) -> None:
     assert options.source is not None
     assert options.out is not None
     if options.export:
-        print(*_export(options.kind, options.source, options.out, options.part), sep="\n")
-        return
-    if options.kind == "tokenizer":
+        cure = "is no directory made here, to export from; leave out --export to import a file"
+        require(options.source.is_dir(), f"{options.source}: {cure}")
+        if options.kind == "ivideogpt":
+            lines = ivideogpt.export(options.source, options.out, options.part)
+        elif options.kind == "cogvideox":
+            lines = cogvideox.export(options.source, options.out, options.part)
+        else:
+            one = {"tokenizer": tokenizer, "genie": genie, "irasim": irasim, "sdxl": kl_autoencoder}
+            lines = one[options.kind].export(options.source, options.out)
+    elif options.kind == "tokenizer":
         lines = tokenizer.convert(options.source, options.out, options.weights or "raw")
     elif options.kind == "genie":
         lines = genie.convert(options.source, options.out, options.heads)
@@ -126,17 +133,3 @@ def main(argv: Sequence[str] | None = None) -> None:
             files.append(options.heads_file)
         lines = lpips.convert(files, options.out)
     print(*lines, sep="\n")
-
-
-def _export(kind: str, source: Path, out: Path, part: Literal["tokenizer", "world_model"] | None) -> list[str]:
-    from rsjax.tools.convert import cogvideox, genie, irasim, ivideogpt, kl_autoencoder, tokenizer
-
-    require(
-        source.is_dir(), f"{source}: is no directory made here, to export from; leave out --export to import a file"
-    )
-    if kind == "ivideogpt":
-        return ivideogpt.export(source, out, part)
-    if kind == "cogvideox":
-        return cogvideox.export(source, out, part)
-    one = {"tokenizer": tokenizer, "genie": genie, "irasim": irasim, "sdxl": kl_autoencoder}
-    return one[kind].export(source, out)

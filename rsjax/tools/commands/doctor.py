@@ -60,7 +60,7 @@ def main() -> None:
     from rich.console import Console
 
     from rsjax.processes import count_workers
-    from rsjax.tools.ingest.doctor import Thresholds, diagnose, open_any
+    from rsjax.tools.ingest.doctor import Thresholds, diagnose, open_any, write_selection
     from rsjax.tools.ingest.options import source_options
 
     console = Console(highlight=False, markup=False, emoji=False, soft_wrap=True)
@@ -69,22 +69,26 @@ def main() -> None:
         limits = Thresholds(options.frames, options.gap, options.unusual)
         show = lambda done: status.update(f"checking episodes: {done}")  # noqa: E731
         diagnosis = diagnose(source, limits, options.ignore, show, count_workers(options.workers))
-    _print_findings(diagnosis, options.lines or sys.maxsize, console)
-    _print_counts(diagnosis, console)
-    if options.fix is not None:
-        console.print(_fix(diagnosis, options.fix, f"{source.name} {options.path or options.what}"))
-    if diagnosis.findings:
-        raise SystemExit(1)
-
-
-def _print_findings(diagnosis: "Diagnosis", most: int, console: "Console") -> None:
     findings = diagnosis.findings
+    most = options.lines or sys.maxsize
     for finding in findings[:most]:
         console.print(f"{finding.episode}: {finding.kind}: {finding.detail}")
     if len(findings) > most:
         console.print(f"… and {len(findings) - most} more; --lines 0 prints all")
     for name, notes in diagnosis.mended[: max(0, most - len(findings))]:
         console.print(f"{name}: mended: {notes}")
+    _print_counts(diagnosis, console)
+    if options.fix is not None:
+        about = f"{source.name} {options.path or options.what}"
+        kept, out = write_selection(options.fix, about, diagnosis.refs, diagnosis.reasons())
+        line = f"{options.fix}: keeps {kept}, leaves out {out}"
+        if not kept:
+            common = diagnosis.usual()
+            cure = f"--ignore {' '.join(common)}" if common else "mend what is wrong"
+            line = f"{line}; nothing is left to ingest: {cure}, and write it again"
+        console.print(line)
+    if findings:
+        raise SystemExit(1)
 
 
 def _print_counts(diagnosis: "Diagnosis", console: "Console") -> None:
@@ -106,16 +110,3 @@ def _print_counts(diagnosis: "Diagnosis", console: "Console") -> None:
     console.print(f"{total} episodes: {total - bad} without a finding, {bad} with")
     if diagnosis.mended:
         console.print(f"mended by the reader, which is no finding: {len(diagnosis.mended)}")
-
-
-def _fix(diagnosis: "Diagnosis", path: Path, about: str) -> str:
-    """Writes the list of the episodes without a finding, and returns a line that reports it."""
-    from rsjax.tools.ingest.doctor import write_selection
-
-    kept, out = write_selection(path, about, diagnosis.refs, diagnosis.reasons())
-    line = f"{path}: keeps {kept}, leaves out {out}"
-    if kept:
-        return line
-    common = diagnosis.usual()
-    cure = f"--ignore {' '.join(common)}" if common else "mend what is wrong"
-    return f"{line}; nothing is left to ingest: {cure}, and write it again"

@@ -47,20 +47,15 @@ def with_estimates(run: Run, loop: LoopConfig) -> LoopConfig:
         if component.annotations == "own":
             return component
         clips = estimated_clips(run, component.annotations)
-        store = _prepared(run, clips, component.annotations)
+        assets = Assets(Normalization.create(run.open_clips()), load_tokenizer(run.config, run.directory))
+        folder = run.directory / "world_model" / component.annotations
+        with disk_guard(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+        store = create_model(run.config).prepare(clips, assets, folder, run.config.runtime.max_damaged) or clips
         return replace(component, annotations="own", store=str(store.path))
 
     stages = [replace(stage, components=tuple(map(named, stage.components))) for stage in loop.curriculum]
     return replace(loop, curriculum=tuple(stages))
-
-
-def _prepared(run: Run, clips: Store, annotations: str) -> Store:
-    """Returns the store that the world model trains on instead of these clips, by the run's tokenizer."""
-    assets = Assets(Normalization.create(run.open_clips()), load_tokenizer(run.config, run.directory))
-    folder = run.directory / "world_model" / annotations
-    with disk_guard(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-    return create_model(run.config).prepare(clips, assets, folder, run.config.runtime.max_damaged) or clips
 
 
 def estimated_clips(run: Run, annotations: str) -> Store:

@@ -11,7 +11,7 @@ from typing import Any
 import jax
 
 import rsjax
-from rsjax.config import Config, EvalConfig, content_key, to_dict
+from rsjax.config import Config, content_key, to_dict
 from rsjax.data.clips import frame_rate
 from rsjax.data.store import Store, open_store
 from rsjax.errors import UserError
@@ -86,7 +86,12 @@ def evaluate_run(directory: Path, data: Path, request: Request) -> Iterator[Path
     standard = find(request.protocol, config)
     protocol = replace(standard, **request.changes, splits=request.splits or standard.splits)
     check_request(config, protocol)
-    trained = _sampling(replace(load(directory), config=config), protocol)
+    trained = replace(load(directory), config=config)
+    sampling = getattr(config.model, "sample", None)
+    known = {each.name for each in fields(sampling)} if is_dataclass(sampling) else set()
+    if missing := ", ".join(sorted(protocol.sampling.keys() - known)):
+        note(f"a model of family {config.model.family!r} has no {missing}, which {protocol.name} fixes; left out")
+    trained = resampled(trained, {name: value for name, value in protocol.sampling.items() if name in known})
     run = Run(config, directory, data)
     store = run.open_clips()
     check_depth(run)
@@ -208,10 +213,15 @@ def _described(trained: TrainedModel, run: Run, store: Store, eval_clips: Evalua
     frames, size = eval_clips.clips.rgb.shape[1:3]
     rate = frame_rate(eval_clips.records[0], eval_clips.store.manifest)
     data = {name: value for name, value in data_fingerprint(eval_clips.store.path).items() if name != "splits"}
+    by_hash = to_dict(by_content(config.eval))  # files by their content
+    settings = {name: value for name, value in by_hash.items() if name not in NOT_OF_METRICS}
+    settings["physics_iq_threshold"] = THRESHOLD
+    if eval_clips.retakes is not None:
+        settings["second_take_jitter"] = retakes.JITTER
     return {
         "protocol": eval_clips.protocol.described(),
         "sampling": _sample_settings(config),
-        "settings": _settings(config.eval) | _take_settings(eval_clips),
+        "settings": settings,
         "data": data | {"split": eval_clips.split, "frames": frames, "image_size": size, "fps": rate},
         "model": {
             "run": str(run.directory),
@@ -254,27 +264,6 @@ def _parts(folder: Path, key: str) -> Path:
     return folder / f"parts-{key}"
 
 
-def _settings(settings: EvalConfig) -> dict[str, Any]:
-    """Returns what the metrics depend on: the settings, with files by content, and the threshold of motion masks."""
-    values = {name: value for name, value in to_dict(by_content(settings)).items() if name not in NOT_OF_METRICS}
-    return values | {"physics_iq_threshold": THRESHOLD}
-
-
-def _take_settings(eval_clips: EvaluationClips) -> dict[str, Any]:
-    return {} if eval_clips.retakes is None else {"second_take_jitter": retakes.JITTER}
-
-
 def _sample_settings(config: Config) -> dict[str, Any]:
     settings = getattr(config.model, "sample", None)
     return to_dict(settings) if is_dataclass(settings) else {}
-
-
-def _sampling(trained: TrainedModel, protocol: Protocol) -> TrainedModel:
-    """Returns the model with the protocol's sampling settings; a note names those that its family does not have."""
-    settings = getattr(trained.config.model, "sample", None)
-    known = {each.name for each in fields(settings)} if is_dataclass(settings) else set()
-    if missing := ", ".join(sorted(protocol.sampling.keys() - known)):
-        note(
-            f"a model of family {trained.config.model.family!r} has no {missing}, which {protocol.name} fixes; left out"
-        )
-    return resampled(trained, {name: value for name, value in protocol.sampling.items() if name in known})

@@ -145,12 +145,11 @@ def training_settings(config: Config) -> dict[str, Any]:
     trained: dict[str, Any] = {name: part for name, part in parts.items() if isinstance(part, TrainConfig)}
     if config.model.uses_tokenizer:
         trained["tokenizer"] = config.tokenizer
-    return {name: _without_runtime(part) for name, part in trained.items()}
-
-
-def _without_runtime(part: Any) -> dict[str, Any]:
-    skipped = {name for name, field in config_fields(part).items() if field.runtime or name in BY_SEED}
-    return {name: value for name, value in to_dict(part).items() if name not in skipped}
+    settings = {}
+    for name, part in trained.items():
+        skipped = {field for field, about in config_fields(part).items() if about.runtime or field in BY_SEED}
+        settings[name] = {field: value for field, value in to_dict(part).items() if field not in skipped}
+    return settings
 
 
 def machine() -> dict[str, Any]:

@@ -7,7 +7,7 @@ under this key (:mod:`rsjax.artifact`); a folder with another key was made by an
 import os
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -116,11 +116,14 @@ class Run:
         keys = {"collect": key}
         if cfg.eval.simulator_steps:
             keys["depth_estimator"] = content_key(RECIPE, "depth_estimator", key, cfg.eval.simulator_steps)
+        evaluation = cfg.eval
+        with suppress(UserError):  # a file that cannot be read: the evaluation reports what is wrong
+            evaluation = _hashed(cfg.eval)
         settings: dict[str, tuple[Any, ...]] = {
             "tokenizer": (cfg.autoencoder, cfg.tokenizer_train),
             "tokens": cfg.model.token_shifts,
             "world_model": (cfg.model, cfg.prompt_frames, cfg.train),
-            "evaluation": (sampling_settings(cfg.model), _by_content(cfg.eval)),
+            "evaluation": (sampling_settings(cfg.model), evaluation),
             "report": (),
         }
         for stage, parts in settings.items():
@@ -253,16 +256,9 @@ class Run:
             yield folder
 
 
-def _by_content(settings: EvalConfig) -> EvalConfig:
-    """Returns the settings with paths of weights replaced by content hashes; unchanged if a file cannot be read."""
-    try:
-        return _hashed(settings)
-    except UserError:
-        return settings  # the evaluation reports what is wrong
-
-
 @cache  # hashing large files takes seconds
 def _hashed(settings: EvalConfig) -> EvalConfig:
+    """Returns the settings with paths of weights replaced by content hashes."""
     from rsjax.tools.pipeline.metric_files import by_content  # here, because it loads jax
 
     return by_content(settings)

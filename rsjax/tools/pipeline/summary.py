@@ -27,6 +27,14 @@ def write_summary(run: Run, command: str) -> None:
     seconds = {stage: run.seconds(stage) for stage in run.stages[:-1] if run.mark(stage)}
     metrics = result.metrics | {"seconds_total": round(sum(seconds.values()), 1)}
     cfg = run.config
+    start = read_starts(run.directory)[-1]
+    machine = start["machine"]
+    versions = {name: start["packages"][name] for name in LIBRARIES if name in start["packages"]}
+    versions |= {
+        "python": machine["python"],
+        "system": machine["system"],
+        "device": f"{machine['local_devices']} × {machine['device_kind']}, {machine['cpu_cores']} CPU cores",
+    }
     report = RunReport(
         preset=cfg.name,
         metrics=metrics,
@@ -36,7 +44,7 @@ def write_summary(run: Run, command: str) -> None:
         per_clip=result.per_clip,
         logs={stage.replace("_", " "): read_log(run.directory / stage) for stage in TRAINED},
         config=to_dict(cfg),
-        versions=_versions(run),
+        versions=versions,
         seconds=seconds,
         command=command,
         show_targets=cfg.name == "tiny" and cfg.data is None,  # the targets hold for simulated clips
@@ -75,15 +83,3 @@ def _rank(rank: int, clips: int) -> str:
         return "typical"
     ending = {1: "st ", 2: "nd ", 3: "rd "}.get(rank % 10 * (rank // 10 % 10 != 1), "th ")
     return f"{'' if rank == 1 else f'{rank}{ending}'}worst of {clips}"
-
-
-def _versions(run: Run) -> dict[str, str]:
-    start = read_starts(run.directory)[-1]
-    # may lack the simulator's packages
-    machine = start["machine"]
-    versions = start["packages"]
-    return {name: versions[name] for name in LIBRARIES if name in versions} | {
-        "python": machine["python"],
-        "system": machine["system"],
-        "device": f"{machine['local_devices']} × {machine['device_kind']}, {machine['cpu_cores']} CPU cores",
-    }

@@ -52,15 +52,6 @@ class WorldModelValidation:
         numbers = spread(self._prepared, LOSS_CLIPS)
         batches = record_batches(self._model, self._assets.normalization, self._prepared, cfg.eval.batch_size, numbers)
         loss = validation_loss(self._model, weights, batches)
-        scores, pictures = self._videos(step, weights)
-        scalars = {f"validation/{name}": value for name, value in (loss | scores).items()}
-        metric = loss["loss"]
-        if cfg.train.early_stop is not None:  # the loss rises long before the videos get worse
-            metric = -scores.get("psnr_motion", scores["psnr"])
-        return Validation(metric, scalars, pictures)
-
-    def _videos(self, step: int, weights: Params) -> tuple[dict[str, float], dict[str, np.ndarray]]:
-        cfg = self.run.config
         clips = self._clips
         prompt = clips.video.frames(0, cfg.prompt_frames)
         made = self._model.generate(weights, self._assets, prompt, clips.actions, index=clips.index)
@@ -78,7 +69,11 @@ class WorldModelValidation:
                 prompt_frames=cfg.prompt_frames,
             )
             pictures[f"clip_{number:03d}"] = filmstrip(figure)
-        return scores, pictures
+        scalars = {f"validation/{name}": value for name, value in (loss | scores).items()}
+        metric = loss["loss"]
+        if cfg.train.early_stop is not None:  # the loss rises long before the videos get worse
+            metric = -scores.get("psnr_motion", scores["psnr"])
+        return Validation(metric, scalars, pictures)
 
     @cached_property
     def _model(self) -> WorldModel[Any]:
@@ -155,10 +150,13 @@ class TokenizerValidation:
             scalars["validation/psnr_depth"] = of_depth = _psnr(colors, depth)
             share = cfg.tokenizer_train.depth_share
             metric = -((1 - share) * of_rgb + share * of_depth)
-        pictures = {
-            f"clip_{number:03d}": _sheet(f"clip {number} at step {step}", shown[number])
-            for number in clips.index[:REPORT_CLIPS]
-        }
+        pictures = {}
+        for number in clips.index[:REPORT_CLIPS]:
+            strips = []  # originals above reconstructions
+            for truth, seen in shown[number]:
+                figure = ClipFigure(f"clip {number} at step {step}", truth, None, reconstruction=seen, prompt_frames=0)
+                strips.append(filmstrip(figure))
+            pictures[f"clip_{number:03d}"] = np.concatenate(strips)
         return Validation(metric, scalars, pictures)
 
     @cached_property
@@ -176,12 +174,6 @@ class TokenizerValidation:
 
 def _psnr(truth: UInt8[np.ndarray, "B T H W 3"], seen: UInt8[np.ndarray, "B T H W 3"]) -> float:
     return float(np.mean(psnr(truth, seen)))
-
-
-def _sheet(title: str, pairs: list[tuple[np.ndarray, np.ndarray]]) -> UInt8[np.ndarray, "h w 3"]:
-    """Draws originals above reconstructions."""
-    figures = (ClipFigure(title, truth, prediction=None, reconstruction=seen, prompt_frames=0) for truth, seen in pairs)
-    return np.concatenate([filmstrip(figure) for figure in figures])
 
 
 def record_batches(

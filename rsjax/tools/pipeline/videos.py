@@ -99,7 +99,12 @@ def write_videos(
             name += "_other_actions"
         if request.frames is not None:
             name += f"_{request.frames}_frames"
-        actions = _lasting(actions, request, config)
+            if request.frames <= config.prompt_frames:
+                prompt_frames = config.prompt_frames
+                raise UserError(f"--frames is {request.frames}, but the prompt has {prompt_frames}; set it higher")
+            check_rollout(config, request.frames)
+            turns = 1 + np.arange(request.frames - 1) % (len(actions) - 1)  # row 0 is not an action
+            actions = actions[np.concatenate([[0], turns])]
         prompt = Clips.stacked([clip], [number]).video.frames(0, config.prompt_frames)
         inputs = (trained.params, trained.assets, prompt, actions[None])
         made = trained.model.generate(*inputs, index=np.array([number]))
@@ -187,17 +192,6 @@ def _foreign_actions(request: Request, source: Source, config: Config) -> Float[
     if actions.dtype.kind not in "fiu" or not np.isfinite(actions).all():
         raise UserError(f"{request.actions}: {actions.dtype} with values that are not finite numbers; give floats")
     return actions
-
-
-def _lasting(actions: Float[np.ndarray, "T A"], request: Request, config: Config) -> Float[np.ndarray, "F A"]:
-    """Returns actions for the requested frames: cut, or repeated except for row 0, which is not an action."""
-    if request.frames is None:
-        return actions
-    if request.frames <= config.prompt_frames:
-        raise UserError(f"--frames is {request.frames}, but the prompt has {config.prompt_frames}; set it higher")
-    check_rollout(config, request.frames)
-    turns = 1 + np.arange(request.frames - 1) % (len(actions) - 1)
-    return actions[np.concatenate([[0], turns])]
 
 
 def resampled(trained: TrainedModel, sample: dict[str, Any]) -> TrainedModel:

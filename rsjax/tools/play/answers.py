@@ -6,7 +6,7 @@ from collections.abc import Awaitable, Callable
 from typing import Any
 
 from rsjax.tools.play import keep
-from rsjax.tools.play.link import Saved, read_state, state_of
+from rsjax.tools.play.link import read_state, state_of
 from rsjax.tools.play.messages import MOST_ID, Refused, choice, kinds, number, whole, words
 from rsjax.tools.play.pictures import Place, read_picture
 from rsjax.tools.play.session import MOST_SEED
@@ -189,16 +189,6 @@ async def _load(viewer: Viewer, message: Message) -> Message:
     viewer.begun()
     session.settings = saved.settings
     await viewer.show(0, 0, message["id"])
-    await _grow(viewer, saved, message["id"])
-    if saved.lanes != session.engine.lanes:
-        text = f"made with --lanes {saved.lanes}, here are {session.engine.lanes}: frames may differ in their last bit"
-        session.send({"type": "status", "text": text, "busy": False})
-    return {"type": "session"} | viewer.describe()
-
-
-async def _grow(viewer: Viewer, saved: Saved, answered: int) -> None:
-    """Generates a saved session's branches again."""
-    session = viewer.session
     done = 0
     total = sum(len(branch.steps) for branch in saved.branches)
     for place, branch in enumerate(saved.branches):
@@ -209,7 +199,11 @@ async def _grow(viewer: Viewer, saved: Saved, answered: int) -> None:
             frame = await session.step(place, action, decoding)
             if session.out is not None:
                 await session.out.room()
-            await viewer.show(place, frame, answered)
+            await viewer.show(place, frame, message["id"])
             done += 1
             facts = {"done": done, "total": total, "what": "frames"}
-            session.send({"type": "progress", "id": answered} | facts, droppable=True)
+            session.send({"type": "progress", "id": message["id"]} | facts, droppable=True)
+    if saved.lanes != session.engine.lanes:
+        text = f"made with --lanes {saved.lanes}, here are {session.engine.lanes}: frames may differ in their last bit"
+        session.send({"type": "status", "text": text, "busy": False})
+    return {"type": "session"} | viewer.describe()

@@ -74,7 +74,8 @@ class Connection:
             await asyncio.gather(*tasks, return_exceptions=True)
             self._hub.leave(seat, self.end)
         if code:
-            await _closed(self._socket, code, reason)
+            with suppress(RuntimeError, WebSocketDisconnect, OSError):
+                await self._socket.close(code, reason)
 
     def end(self, code: int, reason: str) -> None:
         """Ends the connection; code 0 means that the page has left."""
@@ -165,8 +166,3 @@ def error_id(text: str | None) -> int:
     if type(number) is int and 0 < number < 2**32:
         return number
     return 0
-
-
-async def _closed(socket: WebSocket, code: int, reason: str) -> None:
-    with suppress(RuntimeError, WebSocketDisconnect, OSError):
-        await socket.close(code, reason)

@@ -146,7 +146,8 @@ class Engine:
         key = works[0].key
         fresh = works[0].key not in self._compiled
         if fresh:
-            _tell(works, f"compiling for {_count(key[1][0], 'decoding step')} …", True)
+            steps = key[1][0]
+            _tell(works, f"compiling for {steps} decoding step{'s' * (steps != 1)} …", True)
         try:
             inputs = ([work.state for work in works], np.stack([work.action for work in works]))
             return self.branching(key[0]).advance(*inputs, [work.decoding for work in works])
@@ -172,7 +173,3 @@ def _tell(works: list[Work], text: str, busy: bool) -> None:
     for work in works:
         with suppress(RuntimeError):  # the server has stopped
             work.say(text, busy)
-
-
-def _count(number: int, what: str) -> str:
-    return f"{number} {what}{'' if number == 1 else 's'}"

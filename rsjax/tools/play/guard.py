@@ -10,6 +10,7 @@ from starlette.datastructures import Headers
 from starlette.types import ASGIApp as App
 from starlette.types import Message, Receive, Scope, Send
 
+# The value of a Host header: a name or an address, in brackets if it is one of IPv6, and a port.
 _HOST = re.compile(r"(\[[^\[\]]+\]|[^\[\]:]+)(?::[0-9]{1,5})?")
 HEADERS = {
     "content-security-policy": (
@@ -50,7 +51,10 @@ class Guard:
         name was made to point to this machine sends that name as the Host.
         """
         host = headers.get("host", "")
-        if not self.token and not is_loopback(_name(host)):
+        name = ""
+        if match := _HOST.fullmatch(host):
+            name = match[1]
+        if not self.token and not is_loopback(name):
             return f"this server answers to localhost only, not to {host!r:.80}"
         return ""
 
@@ -92,11 +96,3 @@ class Guarded:
             await JSONResponse({"error": "host", "message": wrong}, 403)(scope, receive, headed)
             return
         await self._app(scope, receive, headed)
-
-
-def _name(host: str) -> str:
-    """Returns a Host header without its port, or "" if it is none: an address of IPv6 is in brackets."""
-    match = _HOST.fullmatch(host)
-    if match is None:
-        return ""
-    return match[1]

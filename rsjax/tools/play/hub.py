@@ -81,7 +81,17 @@ class Hub:
             seat.close = close
             seat.viewer.session.used = time.monotonic()
             return seat, True
-        self._make_room()
+        if len(self._seats) >= self.most:
+            gone = [seat for seat in self._seats.values() if seat.close is None]
+            oldest = min(gone, key=lambda seat: seat.left, default=None)
+            if oldest is None or time.monotonic() - oldest.left <= self._grace:
+                waits = [self.idle - (time.monotonic() - seat.viewer.session.used) for seat in self._seats.values()]
+                waits += [self._grace - (time.monotonic() - seat.left) for seat in gone]
+                soon = _minutes(max(1, round(min(waits))))
+                raise Refused(
+                    "no_session", f"all {self.most} sessions are in use; one is free in {soon} if nobody uses it"
+                )
+            self._free(oldest)
         seat = Seat(Viewer(Session(self.run, self.engine, self._memories), self._side, self.files, self._truths), close)
         self._seats[seat.viewer.session.name] = seat
         return seat, False
@@ -122,21 +132,6 @@ class Hub:
         facts |= self.run.controls.describe() | {"sources": reasons(self.run), "truth": seat.viewer.no_truth}
         facts |= {"settings": session.settings.describe(), "seed": session.seed, "limits": limits}
         return {"type": "welcome"} | facts
-
-    def _make_room(self) -> None:
-        if len(self._seats) < self.most:
-            return
-        gone = [seat for seat in self._seats.values() if seat.close is None]
-        oldest = min(gone, key=lambda seat: seat.left, default=None)
-        if oldest is not None and time.monotonic() - oldest.left > self._grace:
-            self._free(oldest)
-            return
-        waits = [self.idle - (time.monotonic() - seat.viewer.session.used) for seat in self._seats.values()]
-        waits += [self._grace - (time.monotonic() - seat.left) for seat in gone]
-        seconds = max(1, round(min(waits)))
-        raise Refused(
-            "no_session", f"all {self.most} sessions are in use; one is free in {_minutes(seconds)} if nobody uses it"
-        )
 
     def _free(self, seat: Seat) -> None:
         self._seats.pop(seat.viewer.session.name, None)

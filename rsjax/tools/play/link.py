@@ -10,7 +10,7 @@ from itertools import groupby
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32
 from PIL import Image
 
 from rsjax.models.branch_states import Decoding
@@ -62,7 +62,10 @@ def state_of(session: Session) -> str:
     places = {number: place for place, number in enumerate(tree.branches)}
     begun: dict[str, Any] = {"clip": start.number}
     if start.upload is not None:
-        begun = {"upload": _png(start.upload.rgb), "size": list(start.upload.size), "square": start.upload.square}
+        buffer = io.BytesIO()
+        Image.fromarray(start.upload.rgb).save(buffer, "PNG", optimize=True)
+        png = base64.b64encode(buffer.getvalue()).decode()
+        begun = {"upload": png, "size": list(start.upload.size), "square": start.upload.square}
     values = {
         "version": VERSION,
         "run": session.run.fingerprint,
@@ -95,7 +98,10 @@ def read_state(session: Session, text: object) -> Saved:
         rows = values["branches"]
         if not isinstance(rows, list) or not 0 < len(rows) <= MOST_BRANCHES:
             raise Refused("bad_state", f"the link has no branches, or more than {MOST_BRANCHES}")
-        made = [_read_actions(session, row) for row in rows]
+        made = []  # the branches' actions as they were sent; their numbers are not checked yet
+        for row in rows:
+            plain = base64.b64decode(row["actions"], validate=True)
+            made.append(np.frombuffer(plain, "<f4").reshape(-1, session.run.controls.width))
         if sum(map(len, made)) >= session.limits["frames"]:
             raise Refused("bad_state", f"the link has more than {session.limits['frames']} frames")
         branches = [_read_branch(session, row, *each) for row, each in zip(rows, enumerate(made), strict=True)]
@@ -149,12 +155,6 @@ def _branch(branch: Branch, places: dict[int, int]) -> dict[str, Any]:
     return facts | {"actions": base64.b64encode(actions.tobytes()).decode()}
 
 
-def _read_actions(session: Session, row: dict[str, Any]) -> Float32[np.ndarray, "T A"]:
-    """Returns a branch's actions as they were sent, without checking their numbers."""
-    plain = base64.b64decode(row["actions"], validate=True)
-    return np.frombuffer(plain, "<f4").reshape(-1, session.run.controls.width)
-
-
 def _read_branch(session: Session, row: dict[str, Any], place: int, numbers: Float32[np.ndarray, "T A"]) -> SavedBranch:
     limits = session.limits
     actions = [session.run.controls.action(action)[0] for action in numbers]
@@ -174,9 +174,3 @@ def _read_branch(session: Session, row: dict[str, Any], place: int, numbers: Flo
         parent = whole(row, "parent", 0, place - 1)
     steps = list(zip(actions, decodings, strict=True))
     return SavedBranch(parent, whole(row, "fork", 0, MOST_SEED), whole(row, "draw", 0, MOST_SEED), steps)
-
-
-def _png(picture: UInt8[np.ndarray, "S S 3"]) -> str:
-    buffer = io.BytesIO()
-    Image.fromarray(picture).save(buffer, "PNG", optimize=True)
-    return base64.b64encode(buffer.getvalue()).decode()

@@ -31,7 +31,12 @@ def points_of(session: Session, nodes: list[Node], pane: str) -> Points:
         count = session.run.data.config.model.marked_keypoints or MOST
         nodes[known].points[pane] = first_points(session.start, count)
     for before, node in zip(nodes[known:], nodes[known + 1 :], strict=False):
-        node.points[pane] = _followed(_picture(before, pane), _picture(node, pane), before.points[pane])
+        points = before.points[pane]
+        pictures = np.stack([_picture(before, pane), _picture(node, pane)])
+        tracks, visible = LucasKanade().follow(pictures, points[:, :2].copy())
+        seen = visible[:, 1] & (points[:, 2] > 0)  # a lost point stays lost
+        places = np.where(seen[:, None], tracks[:, 1], points[:, :2])
+        node.points[pane] = np.concatenate([places, seen[:, None]], axis=1).astype(np.float32)
     found: Points = nodes[-1].points[pane]
     return found
 
@@ -45,14 +50,6 @@ def first_points(start: Start, count: int) -> Points:
         motion = np.asarray(motion_magnitude(clip["tracks"], clip["visible"]))
         places = clip["tracks"][np.argsort(-motion, kind="stable")[:count], 0]
     return np.concatenate([places, np.ones((len(places), 1))], axis=1).astype(np.float32)
-
-
-def _followed(before: UInt8[np.ndarray, "S S 3"], after: UInt8[np.ndarray, "S S 3"], points: Points) -> Points:
-    """Follows points from one picture to the next; a lost point stays lost."""
-    tracks, visible = LucasKanade().follow(np.stack([before, after]), points[:, :2].copy())
-    seen = visible[:, 1] & (points[:, 2] > 0)
-    places = np.where(seen[:, None], tracks[:, 1], points[:, :2])
-    return np.concatenate([places, seen[:, None]], axis=1).astype(np.float32)
 
 
 def _picture(node: Node, pane: str) -> UInt8[np.ndarray, "S S 3"]:

@@ -112,18 +112,13 @@ def listen(host: str, port: int) -> socket.socket:
 def prepare(run: PlayRun, engine: Engine) -> None:
     """Compiles the programs for the first frame, so that nobody waits for them later, and prints a frame's time."""
     note("compiling (seconds, or minutes for a large model the first time) …")
-    first = Video(_grey(run))
-    size = run.controls.width
+    size = run.data.config.clips.image_size
+    first = Video(np.full((1, 1, size, size, 3), 128, np.uint8))
     with suppress(Refused):
         first = run.first(run.clip(0))
     decoding = first_settings(run.data.config).decoding(0, 0)
-    seconds = warm_up(engine, first, size, decoding)
+    seconds = warm_up(engine, first, run.controls.width, decoding)
     note(f"a frame takes {1000 * seconds:.0f} ms")
-
-
-def _grey(run: PlayRun) -> np.ndarray:
-    size = run.data.config.clips.image_size
-    return np.full((1, 1, size, size, 3), 128, np.uint8)
 
 
 def _address(listener: socket.socket, host: str, guard: Guard) -> str:
@@ -133,8 +128,6 @@ def _address(listener: socket.socket, host: str, guard: Guard) -> str:
         name = host
     if ":" in name:
         name = f"[{name}]"
-    else:
-        name = name
     if guard.token:
         token = f"?token={guard.token}"
     else:

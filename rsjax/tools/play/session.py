@@ -221,7 +221,13 @@ class Session:
         if tree.frames >= self.limits["frames"]:
             raise Refused("full", f"a session can have {self.limits['frames']} frames; begin again, or drop a branch")
         how = decoding or self.settings.decoding(self.seed, branch.draw)
-        await self._recall(branch.nodes)
+        # The last frame may have lost its memory: generate the frames again from the nearest one that has its memory.
+        known = len(branch.nodes) - 1
+        while branch.nodes[known].state.memory is None:
+            known -= 1
+        for before, after in zip(branch.nodes[known:], branch.nodes[known + 1 :], strict=False):
+            assert after.action is not None and after.decoding is not None
+            after.state = await self._advance(before, after.action, after.decoding)
         state = await self._advance(branch.nodes[-1], action, how)
         node = Node(state, action, how)
         self._memories.note(node, self._lighten)
@@ -234,15 +240,6 @@ class Session:
                 for node in branch.nodes:
                     self._memories.forget(node)
         self.tree = self.start = None
-
-    async def _recall(self, nodes: list[Node]) -> None:
-        """Restores the last frame's memory, by generating the frames again from the nearest one that has its memory."""
-        known = len(nodes) - 1
-        while nodes[known].state.memory is None:
-            known -= 1
-        for before, node in zip(nodes[known:], nodes[known + 1 :], strict=False):
-            assert node.action is not None and node.decoding is not None
-            node.state = await self._advance(before, node.action, node.decoding)
 
     async def _advance(self, node: Node, action: Float32[np.ndarray, " A"], how: Decoding) -> BranchState:
         state = node.state

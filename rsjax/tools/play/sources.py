@@ -54,8 +54,16 @@ class Sources:
         frame = len(branch.nodes)
         if reason := reasons(self.run)[kind]:
             raise Refused("no_source", reason)
+        if kind == "clip" and "clip" in source:
+            actions = self.run.clip(whole(source, "clip", 0, 2**31))["actions"]
+            return actions[1 + (frame - 1) % (len(actions) - 1)]
         if kind == "clip":
-            return self._of_clip(session, source, frame)
+            if session.start is None or session.start.clip is None:
+                raise Refused("no_action", "a picture has no actions of its own; choose a clip's")
+            actions = session.start.clip["actions"]
+            if frame >= len(actions):
+                raise Refused("no_action", f"the clip ends after {len(actions)} frames")
+            return actions[frame]
         if kind == "random":
             return self.run.controls.random(np.random.default_rng([session.seed, branch.draw, frame]))
         acting = self.acting.get(branch.number)
@@ -64,24 +72,17 @@ class Sources:
                 acting = self.acting[branch.number] = Acting(kind, self._actor(kind, session, branch))
             except UserError as error:
                 raise Refused("no_source", str(error)) from error
-        return np.asarray(acting.act(_seen(session, branch.nodes[-1])), np.float32)[0]
+        state = branch.nodes[-1].state
+        seen = {"rgb": state.rgb[None]}
+        if session.has_depth and (depth := session.engine.branching(True).depth(state)) is not None:
+            seen["depth"] = depth[None]
+        return np.asarray(acting.act(seen), np.float32)[0]
 
     def acted(self, branch: Branch, source: dict[str, Any] | None) -> None:
         """Notes that an action of this source (None: a person) led to the branch's last frame."""
         acting = self.acting.get(branch.number)
         if acting is not None and source is not None and source["kind"] == acting.kind:
             acting.last = branch.nodes[-1]
-
-    def _of_clip(self, session: Session, source: dict[str, Any], frame: int) -> Float[np.ndarray, " A"]:
-        if "clip" in source:
-            actions = self.run.clip(whole(source, "clip", 0, 2**31))["actions"]
-            return actions[1 + (frame - 1) % (len(actions) - 1)]
-        if session.start is None or session.start.clip is None:
-            raise Refused("no_action", "a picture has no actions of its own; choose a clip's")
-        actions = session.start.clip["actions"]
-        if frame >= len(actions):
-            raise Refused("no_action", f"the clip ends after {len(actions)} frames")
-        return actions[frame]
 
     def _actor(self, kind: str, session: Session, branch: Branch) -> Actor:
         if kind == "policy":
@@ -110,15 +111,6 @@ def _energy(run: PlayRun) -> EnergyName:
     if getattr(run.data.config.model, "state_heads", None) is None:
         return "judge"
     return "success"
-
-
-def _seen(session: Session, node: Node) -> dict[str, np.ndarray]:
-    """Returns a policy's observation of a frame."""
-    seen = {"rgb": node.state.rgb[None]}
-    if session.has_depth:
-        depth = session.engine.branching(True).depth(node.state)
-        seen |= {} if depth is None else {"depth": depth[None]}
-    return seen
 
 
 def check_policy(run: PlayRun) -> None:

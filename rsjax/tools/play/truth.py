@@ -11,7 +11,6 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
-from jaxtyping import UInt8
 
 from rsjax.config import SimConfig
 from rsjax.errors import first_line
@@ -114,17 +113,14 @@ class Follower:
             made = helper(Job(self._task, seed, node.action, node.truth is None), SECONDS)
             self._applied.append(node)
             if made is not None:
-                node.truth = Truth(made.rgb, made.depth, made.success, _psnr(made.rgb, node.state.rgb))
+                error = np.mean((made.rgb.astype(np.float64) - node.state.rgb) ** 2)
+                psnr = None  # of equal pictures
+                if error != 0:
+                    psnr = round(float(10 * np.log10(PEAK**2 / error)), 3)
+                node.truth = Truth(made.rgb, made.depth, made.success, psnr)
                 filled.append(number)
         return filled
 
     def _end(self) -> None:
         if self._helper is not None:
             self._helper.close()
-
-
-def _psnr(one: UInt8[np.ndarray, "H W 3"], other: UInt8[np.ndarray, "H W 3"]) -> float | None:
-    error = np.mean((one.astype(np.float64) - other) ** 2)
-    if error == 0:
-        return None
-    return round(float(10 * np.log10(PEAK**2 / error)), 3)

@@ -136,19 +136,20 @@ class LanguageJudge:
 
     def __call__(self, frames: UInt8[np.ndarray, "B T H W 3"]) -> Float[np.ndarray, "B 3"]:
         """Returns probability 1 for the label that each answer means, and 0 for the others."""
-        return np.eye(len(LABELS))[[answer_label(self._ask(video[-self.frames :])) for video in frames]]
-
-    def _ask(self, frames: UInt8[np.ndarray, "T H W 3"]) -> str:
         from PIL import Image
 
-        images: list[dict[str, Any]] = [{"type": "image", "image": Image.fromarray(frame)} for frame in frames]
         text = {"type": "text", "text": f"{self.question} Answer with one word: yes, no or unclear."}
-        chat = [{"role": "user", "content": [*images, text]}]
         settings = {"add_generation_prompt": True, "tokenize": True, "return_dict": True, "return_tensors": "pt"}
-        inputs = self.processor.apply_chat_template(chat, **settings)
-        made = self.model.generate(**inputs, max_new_tokens=8, do_sample=False)
-        answer: str = self.processor.decode(made[0, inputs["input_ids"].shape[1] :], skip_special_tokens=True)
-        return answer
+        found = []
+        for video in frames:
+            last = video[-self.frames :]
+            images: list[dict[str, Any]] = [{"type": "image", "image": Image.fromarray(frame)} for frame in last]
+            chat = [{"role": "user", "content": [*images, text]}]
+            inputs = self.processor.apply_chat_template(chat, **settings)
+            made = self.model.generate(**inputs, max_new_tokens=8, do_sample=False)
+            answer = self.processor.decode(made[0, inputs["input_ids"].shape[1] :], skip_special_tokens=True)
+            found.append(answer_label(answer))
+        return np.eye(len(LABELS))[found]
 
 
 def answer_label(answer: str) -> int:

@@ -88,14 +88,14 @@ class TrainedJudge:
 
     def __call__(self, frames: UInt8[np.ndarray, "B T H W 3"]) -> Float[np.ndarray, "B 3"]:
         whole = last_frames(frames, frames_of(self))
-        return all_successes(np.stack([self._one(whole[:, place : place + HISTORY]) for place in range(self.in_a_row)]))
-
-    def _one(self, history: UInt8[np.ndarray, "B F H W 3"]) -> Float[np.ndarray, "B 3"]:
-        """Returns the verdicts at the ends of histories, each by itself."""
-        parts = []
-        for start in range(0, len(history), CHUNK):
-            parts.append(np.asarray(_probabilities(self.params, self.temperature, history[start : start + CHUNK])))
-        return np.concatenate(parts)
+        verdicts = []
+        for place in range(self.in_a_row):
+            history = whole[:, place : place + HISTORY]
+            parts = []
+            for start in range(0, len(history), CHUNK):
+                parts.append(np.asarray(_probabilities(self.params, self.temperature, history[start : start + CHUNK])))
+            verdicts.append(np.concatenate(parts))
+        return all_successes(np.stack(verdicts))
 
     def save(self, folder: Path) -> None:
         """Writes what :func:`load_judge` reads, atomically."""
@@ -254,25 +254,24 @@ def spoilt(
 
 
 def _batch(footage: Footage, found: list[np.ndarray], rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Draws histories and their labels: half of them successes, then a quarter of all spoilt."""
+    """Draws histories and their labels: half of them successes, then a quarter of all spoilt.
+
+    Contrast, brightness, position (by up to 2 pixels) and noise change a little, as generated frames vary.
+    """
     half = BATCH // 2
     chosen = np.concatenate([each[rng.integers(len(each), size=half)] for each in found])
-    frames = _altered(footage.histories(*chosen.T), rng)
+    drawn = footage.histories(*chosen.T)
+    one = (len(drawn), 1, 1, 1, 1)
+    shifted = np.roll(drawn, rng.integers(-2, 3, 2), axis=(2, 3)).astype(np.float32)
+    varied = (shifted - 128) * rng.uniform(0.85, 1.15, one) + 128 + rng.normal(0, 8, one)
+    varied += rng.uniform(0, 10, one) * rng.standard_normal(drawn.shape, np.float32)
+    frames = np.clip(np.round(varied), 0, 255).astype(np.uint8)
     labels = np.repeat([SUCCESS, FAIL], half)
     rows = rng.permutation(BATCH)[:SPOILT]
     others = (rows + rng.integers(1, BATCH, SPOILT)) % BATCH  # never the same history
     frames[rows] = spoilt(frames[rows], frames[others], rng)
     labels[rows] = UNINTERPRETABLE
     return frames, labels
-
-
-def _altered(frames: UInt8[np.ndarray, "B F H W 3"], rng: np.random.Generator) -> UInt8[np.ndarray, "B F H W 3"]:
-    """Changes contrast, brightness, position (by up to 2 pixels) and noise a little, as generated frames vary."""
-    one = (len(frames), 1, 1, 1, 1)
-    shifted = np.roll(frames, rng.integers(-2, 3, 2), axis=(2, 3)).astype(np.float32)
-    out = (shifted - 128) * rng.uniform(0.85, 1.15, one) + 128 + rng.normal(0, 8, one)
-    out += rng.uniform(0, 10, one) * rng.standard_normal(frames.shape, np.float32)
-    return np.clip(np.round(out), 0, 255).astype(np.uint8)
 
 
 def _temperature(params: Any, held: Footage, rng: np.random.Generator) -> float:

@@ -186,18 +186,16 @@ class Planner:
         mean = np.tile((self._low + self._high) / 2, (self._config.horizon, 1))
         proposals = None
         if self._propose is not None:
-            proposals = self._fitted(self._propose(frames))
+            proposed = self._propose(frames)
+            # As long as the horizon (the last action goes on), as means of an action's controls.
+            rows = np.minimum(np.arange(self._config.horizon), proposed.shape[1] - 1)
+            proposals = proposed[:, rows].reshape(len(proposed), len(rows), self._config.hold, -1).mean(axis=2)
             mean = proposals[0]
         if self.plan is not None:
             mean = np.concatenate([self.plan.actions[1:], self.plan.actions[-1:]])
         limits = (self._low, self._high)
         self.plan = search(self._held, frames, mean, *limits, self._config, self._rng, proposals)
         return np.tile(self.plan.actions[0], self._config.hold)
-
-    def _fitted(self, proposals: Float[np.ndarray, "N F A"]) -> Float[np.ndarray, "N H a"]:
-        """Returns proposals as long as the horizon (the last action goes on), as means of an action's controls."""
-        rows = np.minimum(np.arange(self._config.horizon), proposals.shape[1] - 1)
-        return proposals[:, rows].reshape(len(proposals), len(rows), self._config.hold, -1).mean(axis=2)
 
     def _held(self, frames: Any, candidates: Float[np.ndarray, "N H a"]) -> Float[np.ndarray, " N"]:
         return self._energy(frames, np.tile(candidates, (1, 1, self._config.hold)))

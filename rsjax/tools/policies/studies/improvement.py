@@ -16,7 +16,6 @@ from rsjax.evaluation.results import fingerprint
 from rsjax.evaluation.statistics import Estimate, share_difference, verdict, wilson
 from rsjax.files import write_file, write_json
 from rsjax.progress import Progress, note, stage
-from rsjax.tools.policies.config import PolicyConfig
 from rsjax.tools.policies.demos import Demos
 from rsjax.tools.policies.judges.validation import markdown, summary
 from rsjax.tools.policies.policy import Policy
@@ -94,7 +93,11 @@ def improve(
     """
     rows: list[dict[str, Any]] = []
     arms = {"imagined": policy, "control": policy}
-    config = _tuning(policy.model.config, settings)  # once: the policies of later rounds have this config already
+    config = policy.model.config  # changed once: the policies of later rounds have these settings already
+    optimizer = config.train.optimizer
+    rate = settings.learning_rate * optimizer.learning_rate
+    optimizer = replace(optimizer, learning_rate=rate, warmup_steps=min(optimizer.warmup_steps, settings.steps // 10))
+    config = replace(config, train=replace(config.train, steps=settings.steps, optimizer=optimizer))
     before = try_policy(policy, simulator, trials.seeds, trials, out / "before", "before")
     for number in range(1, settings.rounds + 1):
         stage(
@@ -126,14 +129,12 @@ def improve(
 def _write(out: Path, results: dict[str, Any]) -> None:
     write_json(out / "results.json", results)
     write_file(out / "results.md", table(results).encode())
-    write_file(out / "success.png", success_curves(_series(results), "rounds"))
-
-
-def _tuning(config: PolicyConfig, settings: Improvement) -> PolicyConfig:
-    optimizer = config.train.optimizer
-    rate = settings.learning_rate * optimizer.learning_rate
-    optimizer = replace(optimizer, learning_rate=rate, warmup_steps=min(optimizer.warmup_steps, settings.steps // 10))
-    return replace(config, train=replace(config.train, steps=settings.steps, optimizer=optimizer))
+    begin = (0.0, _share(results["before"]))
+    series = {
+        arm: [begin, *[(float(row["round"]), _share(row[arm])) for row in results["rounds"]]]
+        for arm in ("imagined", "control")
+    }
+    write_file(out / "success.png", success_curves(series, "rounds"))
 
 
 def imagine(
@@ -225,11 +226,3 @@ def table(results: dict[str, Any]) -> str:
 
 def _share(success: Sequence[bool]) -> Estimate:
     return wilson(sum(success), len(success))
-
-
-def _series(results: dict[str, Any]) -> dict[str, list[tuple[float, Estimate]]]:
-    begin = (0.0, _share(results["before"]))
-    return {
-        arm: [begin, *[(float(row["round"]), _share(row[arm])) for row in results["rounds"]]]
-        for arm in ("imagined", "control")
-    }

@@ -269,7 +269,11 @@ def write_results(out: Path, rows: Sequence[dict[str, Any]], trials: Trials) -> 
     results = results_of(rows, trials)
     write_json(out / "results.json", results)
     write_file(out / "results.md", table(results).encode())
-    points = {row["run"]: _shares(row) for row in rows}
+    points = {}
+    for row in rows:
+        sides = [[each[world] for each in row["policies"].values()] for world in ("simulator", "world_model")]
+        true, imagined = [[wilson(sum(one), len(one)) for one in side] for side in sides]
+        points[row["run"]] = (true, imagined)
     titles = {row["run"]: _title(row) for row in rows}
     write_file(out / "scatter.png", scatter(points, titles))
 
@@ -277,12 +281,6 @@ def write_results(out: Path, rows: Sequence[dict[str, Any]], trials: Trials) -> 
 def results_of(rows: Sequence[dict[str, Any]], trials: Trials) -> dict[str, Any]:
     """Returns the content of ``results.json``."""
     return {"trials": asdict(trials), "runs": list(rows), "trainings": trainings(rows)}
-
-
-def _shares(row: Mapping[str, Any]) -> tuple[list[Estimate], list[Estimate]]:
-    sides = [[each[world] for each in row["policies"].values()] for world in ("simulator", "world_model")]
-    true, imagined = [[wilson(sum(one), len(one)) for one in side] for side in sides]
-    return true, imagined
 
 
 def _title(row: Mapping[str, Any]) -> str:

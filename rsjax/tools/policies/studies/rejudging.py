@@ -73,7 +73,8 @@ def rejudge(out: Path, judge: Judge, name: str) -> Path:
     results = _results(out)
     folder = out / f"judged-{name}"
     rollouts = _rollouts(out, results)
-    true = _true(results)
+    policies = results["runs"][0]["policies"]
+    true = {name: Result(each["simulator"], each["clipped"]["simulator"]) for name, each in policies.items()}
     verdicts = _verdicts(rollouts, judge, folder, name)
     truth = np.concatenate([np.where(each.success, SUCCESS, FAIL) for each in true.values()])
     checked = scores(np.concatenate([verdicts["simulator"][policy] for policy in true]), truth)
@@ -100,11 +101,6 @@ def _results(out: Path) -> dict[str, Any]:
     file = out / "results.json"
     results: dict[str, Any] = read_json(file, cure="compare policies first: rsjax policy_evaluation RUN")
     return results
-
-
-def _true(results: Mapping[str, Any]) -> dict[str, Result]:
-    policies = results["runs"][0]["policies"]
-    return {name: Result(each["simulator"], each["clipped"]["simulator"]) for name, each in policies.items()}
 
 
 def _rollouts(out: Path, results: Mapping[str, Any]) -> dict[str, Rollouts]:

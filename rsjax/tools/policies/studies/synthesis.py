@@ -95,30 +95,24 @@ def synthesize(
     """
     inputs = (model_key(trained), judge_key(judge), fingerprint(((limits.low, limits.high),)))
     key = content_key(5, *inputs, str(store.manifest.get("key")), str(asdict(options)))
-    finished = _finished(out, key)
-    if finished is not None:
+    if (out / SUMMARY).exists():
+        finished: dict[str, Any] = read_json(out / SUMMARY, cure=f"delete {out}")
+        if finished.get("key") != key:
+            raise UserError(
+                f"{out}: holds demonstrations of other settings, another model or judge; choose another --out, or "
+                f"delete it"
+            )
         return finished
     with disk_guard(out), make_once(out / "partial", key, refuse=None, temporary=True) as work:
         _generate(trained, store, work.folder, options, limits, judge, report)
-        clips = write_clips(out / CLIPS, _records(work.folder, options.demos), test_share=0.0)
+        records = (decode(_file(work.folder, number).read_bytes()) for number in range(options.demos))
+        clips = write_clips(out / CLIPS, records, test_share=0.0)
         for version in VERSIONS:
             place = out / f"lerobot-{version}"
             shutil.rmtree(place, ignore_errors=True)  # left by an attempt that did not finish
             export_lerobot(clips, place, LeRobotOptions(version))
         content = {"key": key, **asdict(options), **_summary(clips, judge)}
         write_json(out / SUMMARY, content)
-    return content
-
-
-def _finished(out: Path, key: str) -> dict[str, Any] | None:
-    """Returns the result of a finished call, or None; raises UserError if that call had other inputs."""
-    if not (out / SUMMARY).exists():
-        return None
-    content = read_json(out / SUMMARY, cure=f"delete {out}")
-    if content.get("key") != key:
-        raise UserError(
-            f"{out}: holds demonstrations of other settings, another model or judge; choose another --out, or delete it"
-        )
     return content
 
 
@@ -269,10 +263,6 @@ def labels(rgb: UInt8[np.ndarray, "B T S S 3"], judge: Judge) -> Int[np.ndarray,
 
 def _file(folder: Path, number: int) -> Path:
     return folder / f"{number:06d}.clip"
-
-
-def _records(folder: Path, count: int) -> Iterator[Record]:
-    return (decode(_file(folder, number).read_bytes()) for number in range(count))
 
 
 def _summary(clips: Store, judge: Judge | None) -> dict[str, Any]:

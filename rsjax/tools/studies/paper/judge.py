@@ -8,21 +8,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from rsjax.evaluation import statistics
 from rsjax.evaluation.registry import Metric, Unavailable, metrics
-from rsjax.evaluation.statistics import (
-    Estimate,
-    Statistic,
-    TTest,
-    Verdict,
-    can_lose,
-    holm,
-    nested_bootstrap,
-    paired_bootstrap,
-    paired_t,
-    share_difference,
-    verdict,
-    welch,
-)
+from rsjax.evaluation.statistics import Estimate, Statistic, TTest, Verdict
 from rsjax.tools.pipeline.run import Run
 from rsjax.tools.studies.paper.arm_scores import ArmScores, read_arm
 from rsjax.tools.studies.paper.claim import Claim, Comparison
@@ -149,8 +137,8 @@ def judge_claim(claim: Claim, arms: Sequence[ArmScores]) -> Outcome:
     measured = [_measure(claim, comparison, known) for comparison in claim.comparisons]
     tested = [each for each in measured if each.test is not None and not each.reason]
     margins = [each for each in tested if each.comparison.equal_margin]
-    p = dict(zip(map(id, tested), holm([each.test.p_of(each.shift) for each in tested]), strict=True))  # type: ignore[union-attr]
-    beyond = holm([each.test.p_beyond(each.comparison.equal_margin) for each in margins])  # type: ignore[union-attr]
+    p = dict(zip(map(id, tested), statistics.holm([each.test.p_of(each.shift) for each in tested]), strict=True))  # type: ignore[union-attr]
+    beyond = statistics.holm([each.test.p_beyond(each.comparison.equal_margin) for each in margins])  # type: ignore[union-attr]
     equal_p = dict(zip(map(id, margins), beyond, strict=True))
     judged = []
     for each in measured:
@@ -188,19 +176,19 @@ def _measure(claim: Claim, comparison: Comparison, arms: Mapping[str, ArmScores]
         resampled=resampled,
         clips=min(map(len, pair.a)),
     )
-    compare = paired_t if pair.own_clips else welch
+    compare = statistics.paired_t if pair.own_clips else statistics.welch
     test = compare(a, b, LEVEL)
     inner_test = compare(a, b, EQUAL_LEVEL)
     if test is None or inner_test is None:
         return replace(judged, reason="one seed says nothing about others")
     judged = replace(judged, test=test, difference=_wider(resampled, test), inner=_wider(inner, inner_test))
-    if success and not can_lose(np.stack(pair.b), -comparison.margin):
+    if success and not statistics.can_lose(np.stack(pair.b), -comparison.margin):
         return replace(judged, reason="the other side succeeds too seldom for a loss of the margin to show")
     return judged
 
 
 def _verdict(judged: Judged) -> Verdict:
-    found = verdict(judged.difference, judged.metric.better, judged.comparison.margin)
+    found = statistics.verdict(judged.difference, judged.metric.better, judged.comparison.margin)
     if found != "cannot tell" and judged.p is not None and judged.p < SIGNIFICANT:
         return found
     inner = judged.inner
@@ -216,10 +204,10 @@ def _verdict(judged: Judged) -> Verdict:
 def _resampled(pair: Pair, level: float, statistic: Statistic, success: bool) -> Estimate:
     """Returns the difference with its interval over seeds and clips, or, for success rates, Newcombe's."""
     if success:
-        return share_difference(np.concatenate(pair.a), np.concatenate(pair.b), level)
+        return statistics.share_difference(np.concatenate(pair.a), np.concatenate(pair.b), level)
     if pair.own_clips:
-        return nested_bootstrap(pair.a, pair.b, level=level, statistic=statistic)
-    return paired_bootstrap(np.stack(pair.a), np.stack(pair.b), level=level, statistic=statistic)
+        return statistics.nested_bootstrap(pair.a, pair.b, level=level, statistic=statistic)
+    return statistics.paired_bootstrap(np.stack(pair.a), np.stack(pair.b), level=level, statistic=statistic)
 
 
 def _paired(better: ArmScores, than: ArmScores, comparison: Comparison) -> Pair:
