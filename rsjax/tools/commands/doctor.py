@@ -3,18 +3,12 @@
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import tyro
 
 from rsjax.config import ConfigError
 from rsjax.tools.commands.cli import main_errors, parse_options
 from rsjax.tools.ingest.formats import FORMATS
-
-if TYPE_CHECKING:
-    from rich.console import Console
-
-    from rsjax.tools.ingest.doctor import Diagnosis
 
 PROG = "rsjax doctor"
 
@@ -57,10 +51,12 @@ def main() -> None:
             f"sources: {', '.join(FORMATS)}"
         )
     options = parse_options(sys.argv[1:], PROG, Options.__doc__ or "", Options())
+    from rich.box import SIMPLE_HEAD
     from rich.console import Console
+    from rich.table import Table
 
     from rsjax.processes import count_workers
-    from rsjax.tools.ingest.doctor import Thresholds, diagnose, open_any, write_selection
+    from rsjax.tools.ingest.doctor import KINDS, Thresholds, diagnose, open_any, write_selection
     from rsjax.tools.ingest.options import source_options
 
     console = Console(highlight=False, markup=False, emoji=False, soft_wrap=True)
@@ -77,27 +73,7 @@ def main() -> None:
         console.print(f"… and {len(findings) - most} more; --lines 0 prints all")
     for name, notes in diagnosis.mended[: max(0, most - len(findings))]:
         console.print(f"{name}: mended: {notes}")
-    _print_counts(diagnosis, console)
-    if options.fix is not None:
-        about = f"{source.name} {options.path or options.what}"
-        kept, out = write_selection(options.fix, about, diagnosis.refs, diagnosis.reasons())
-        line = f"{options.fix}: keeps {kept}, leaves out {out}"
-        if not kept:
-            common = diagnosis.usual()
-            cure = f"--ignore {' '.join(common)}" if common else "mend what is wrong"
-            line = f"{line}; nothing is left to ingest: {cure}, and write it again"
-        console.print(line)
     if findings:
-        raise SystemExit(1)
-
-
-def _print_counts(diagnosis: "Diagnosis", console: "Console") -> None:
-    from rich.box import SIMPLE_HEAD
-    from rich.table import Table
-
-    from rsjax.tools.ingest.doctor import KINDS
-
-    if diagnosis.findings:
         table = Table("kind", "episodes", "meaning", box=SIMPLE_HEAD, pad_edge=False)
         for kind, count in diagnosis.counts().items():
             table.add_row(kind, str(count), KINDS[kind])
@@ -110,3 +86,14 @@ def _print_counts(diagnosis: "Diagnosis", console: "Console") -> None:
     console.print(f"{total} episodes: {total - bad} without a finding, {bad} with")
     if diagnosis.mended:
         console.print(f"mended by the reader, which is no finding: {len(diagnosis.mended)}")
+    if options.fix is not None:
+        about = f"{source.name} {options.path or options.what}"
+        kept, out = write_selection(options.fix, about, diagnosis.refs, reasons)
+        line = f"{options.fix}: keeps {kept}, leaves out {out}"
+        if not kept:
+            common = diagnosis.usual()
+            cure = f"--ignore {' '.join(common)}" if common else "mend what is wrong"
+            line = f"{line}; nothing is left to ingest: {cure}, and write it again"
+        console.print(line)
+    if findings:
+        raise SystemExit(1)

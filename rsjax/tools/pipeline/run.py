@@ -209,10 +209,17 @@ class Run:
             return f"of another version: {error}"
         except (FileError, TypeError):
             return "its config.json is missing or damaged"
-        there, here = (
-            {name: value for part in DECIDED_BY[stage] for name, value in _deciding(*_section(config, part))}
-            for config in (saved, self.config)
-        )
+        decided = []
+        for config in (saved, self.config):
+            own = config.model.own_autoencoder
+            values: dict[str, Any] = {}
+            for part in DECIDED_BY[stage]:
+                if part == "tokenizer" and own is not None:
+                    values |= dict(_deciding(own, "model.autoencoder"))
+                else:
+                    values |= dict(_deciding(getattr(config, part), part))
+            decided.append(values)
+        there, here = decided
         pairs = {name: (there.get(name, "not set"), here.get(name, "not set")) for name in here | there}
         return "; ".join(f"{name} is {a} there, {b} here" for name, (a, b) in pairs.items() if a != b) or "older code"
 
@@ -262,12 +269,6 @@ def _hashed(settings: EvalConfig) -> EvalConfig:
     from rsjax.tools.pipeline.metric_files import by_content  # here, because it loads jax
 
     return by_content(settings)
-
-
-def _section(config: Config, part: str) -> tuple[Any, str]:
-    """Returns a section of the configuration and its dotted name; the tokenizer may be the model's own autoencoder."""
-    own = config.model.own_autoencoder if part == "tokenizer" else None
-    return (getattr(config, part), part) if own is None else (own, "model.autoencoder")
 
 
 def _deciding(value: Any, name: str) -> Iterator[tuple[str, Any]]:

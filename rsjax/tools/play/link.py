@@ -17,7 +17,6 @@ from rsjax.models.branch_states import Decoding
 from rsjax.tools.play.messages import TEXT_BYTES, Refused, parse_json, whole
 from rsjax.tools.play.pictures import MOST_SIDE, Upload, read_picture
 from rsjax.tools.play.session import MOST_BRANCHES, MOST_SEED, Session, Settings, Start
-from rsjax.tools.play.tree import Branch
 
 VERSION = 1
 MOST_TEXT = TEXT_BYTES - 1024  # characters, because a link must fit into one message
@@ -59,7 +58,15 @@ def state_of(session: Session) -> str:
     tree = session.grown
     start = session.start
     assert start is not None
-    places = {number: place for place, number in enumerate(tree.branches)}
+    places: dict[int | None, int | None] = {None: None}  # of each branch among the saved ones; the first has no parent
+    branches = []
+    for place, (number, branch) in enumerate(tree.branches.items()):
+        places[number] = place
+        made = branch.nodes[1 + int(branch.fork or 0) :]
+        actions = np.array([node.action for node in made], "<f4")
+        how = [[vars(how), len(list(same))] for how, same in groupby(node.decoding for node in made)]
+        facts = {"parent": places[branch.parent], "fork": int(branch.fork or 0), "draw": branch.draw, "how": how}
+        branches.append(facts | {"actions": base64.b64encode(actions.tobytes()).decode()})
     begun: dict[str, Any] = {"clip": start.number}
     if start.upload is not None:
         buffer = io.BytesIO()
@@ -74,7 +81,7 @@ def state_of(session: Session) -> str:
         "start": begun,
         "seed": session.seed,
         "settings": session.settings.describe(),
-        "branches": [_branch(branch, places) for branch in tree.branches.values()],
+        "branches": branches,
     }
     text = base64.urlsafe_b64encode(zlib.compress(json.dumps(values).encode(), 9)).decode().rstrip("=")
     if len(text) > MOST_TEXT:
@@ -141,18 +148,6 @@ def _start(session: Session, values: dict[str, Any]) -> Start:
         raise Refused("bad_state", f"the link's picture has {picture.size} pixels, not {size} × {size}")
     width, height = (whole({"size": side}, "size", 1, MOST_SIDE) for side in begun["size"])
     return Start(None, None, Upload(picture.rgb, (width, height), whole(begun, "square", 1, min(width, height))))
-
-
-def _branch(branch: Branch, places: dict[int, int]) -> dict[str, Any]:
-    made = branch.nodes[1 + int(branch.fork or 0) :]
-    actions = np.array([node.action for node in made], "<f4")
-    how = [[vars(how), len(list(same))] for how, same in groupby(node.decoding for node in made)]
-    if branch.parent is None:
-        parent = None
-    else:
-        parent = places[branch.parent]
-    facts = {"parent": parent, "fork": int(branch.fork or 0), "draw": branch.draw, "how": how}
-    return facts | {"actions": base64.b64encode(actions.tobytes()).decode()}
 
 
 def _read_branch(session: Session, row: dict[str, Any], place: int, numbers: Float32[np.ndarray, "T A"]) -> SavedBranch:

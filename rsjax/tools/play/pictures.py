@@ -60,11 +60,13 @@ def read_picture(payload: bytes, side: int) -> Upload:
         Refused: the payload is no such picture, or the picture is damaged, too large or too small.
     """
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", Image.DecompressionBombWarning)
-            with Image.open(io.BytesIO(payload), formats=FORMATS) as image:
-                _check_size(*image.size)
-                upright = ImageOps.exif_transpose(image).convert("RGB")
+        strict = warnings.catch_warnings(action="error", category=Image.DecompressionBombWarning)
+        with strict, Image.open(io.BytesIO(payload), formats=FORMATS) as image:
+            width, height = image.size
+            if max(width, height) > MOST_SIDE or min(width, height) < LEAST_SIDE:
+                sides = f"{LEAST_SIDE} to {MOST_SIDE} pixels a side"
+                raise Refused("bad_image", f"the picture has {width} × {height} pixels; it can have {sides}")
+            upright = ImageOps.exif_transpose(image).convert("RGB")
     except Refused:
         raise
     except Exception as error:  # decoders raise all kinds of exceptions for damaged files
@@ -76,12 +78,6 @@ def read_picture(payload: bytes, side: int) -> Upload:
     else:
         scaled = middle.resize((side, side), Image.Resampling.LANCZOS)
     return Upload(np.asarray(scaled), upright.size, square)
-
-
-def _check_size(width: int, height: int) -> None:
-    if max(width, height) > MOST_SIDE or min(width, height) < LEAST_SIDE:
-        sides = f"{LEAST_SIDE} to {MOST_SIDE} pixels a side"
-        raise Refused("bad_image", f"the picture has {width} × {height} pixels; it can have {sides}")
 
 
 class Place(NamedTuple):

@@ -270,31 +270,28 @@ def write_results(out: Path, rows: Sequence[dict[str, Any]], trials: Trials) -> 
     write_json(out / "results.json", results)
     write_file(out / "results.md", table(results).encode())
     points = {}
+    titles = {}
     for row in rows:
         sides = [[each[world] for each in row["policies"].values()] for world in ("simulator", "world_model")]
         true, imagined = [[wilson(sum(one), len(one)) for one in side] for side in sides]
         points[row["run"]] = (true, imagined)
-    titles = {row["run"]: _title(row) for row in rows}
+        title = ""
+        if "pearson" in row:
+            r, bounds = r_text(row["pearson"])
+            if r == ABSENT:
+                title = f"{bounds}, "
+            elif bounds:
+                title = f"r = {r} [{bounds}], "
+            else:
+                title = f"r = {r}, "
+            title += f"MMRV {row['mmrv']:.2f}, bias {row['bias']:+.2f}"
+        titles[row["run"]] = title
     write_file(out / "scatter.png", scatter(points, titles))
 
 
 def results_of(rows: Sequence[dict[str, Any]], trials: Trials) -> dict[str, Any]:
     """Returns the content of ``results.json``."""
     return {"trials": asdict(trials), "runs": list(rows), "trainings": trainings(rows)}
-
-
-def _title(row: Mapping[str, Any]) -> str:
-    if "pearson" not in row:
-        return ""
-    r, bounds = r_text(row["pearson"])
-    if r == ABSENT:
-        r = bounds
-        bounds = ""
-    else:
-        r = f"r = {r}"
-    if bounds:
-        bounds = f" [{bounds}]"
-    return f"{r}{bounds}, MMRV {row['mmrv']:.2f}, bias {row['bias']:+.2f}"
 
 
 def r_text(r: Mapping[str, float | None]) -> tuple[str, str]:

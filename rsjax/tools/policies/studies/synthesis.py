@@ -129,7 +129,17 @@ def _generate(
     source = store.source(options.split)
     chosen = choose_clips(store, options)
     spread = np.asarray(trained.assets.normalization.action_std)
-    _check_fits(source[chosen[0]], store, trained, options)
+    first_clip = source[chosen[0]]
+    check_takes_actions(trained.config.model)
+    size = trained.config.clips.image_size
+    width = len(spread)
+    if first_clip["actions"].shape[1] != width:
+        raise UserError(f"{store.path}: actions of {first_clip['actions'].shape[1]} numbers, the model takes {width}")
+    if first_clip["rgb"].shape[1:3] != (size, size):
+        height, wide = first_clip["rgb"].shape[1:3]
+        raise UserError(f"{store.path}: frames of {wide} × {height} pixels, the model takes {size} × {size}")
+    if not options.fps and not frame_rate(first_clip, store.manifest):
+        raise UserError(f"{store.path}: its clips do not say how many frames a second have; give --fps")
     for first in range(0, options.demos, options.batch):
         numbers = range(first, min(first + options.batch, options.demos))
         if not all(_file(folder, number).exists() for number in numbers):
@@ -144,20 +154,6 @@ def _generate(
             ):
                 write_atomically(_file(folder, number), encode(record))
         report(numbers[-1] + 1, options.demos)
-
-
-def _check_fits(clip: Record, store: Store, trained: TrainedModel, options: Synthesis) -> None:
-    """Raises UserError unless the model takes clips like this one, and they contain what the exports need."""
-    check_takes_actions(trained.config.model)
-    size = trained.config.clips.image_size
-    width = len(trained.assets.normalization.action_std)
-    if clip["actions"].shape[1] != width:
-        raise UserError(f"{store.path}: actions of {clip['actions'].shape[1]} numbers, the model takes {width}")
-    if clip["rgb"].shape[1:3] != (size, size):
-        height, wide = clip["rgb"].shape[1:3]
-        raise UserError(f"{store.path}: frames of {wide} × {height} pixels, the model takes {size} × {size}")
-    if not options.fps and not frame_rate(clip, store.manifest):
-        raise UserError(f"{store.path}: its clips do not say how many frames a second have; give --fps")
 
 
 def _generated(

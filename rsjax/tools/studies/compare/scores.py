@@ -184,25 +184,21 @@ def difference(entry: Entry, reference: Entry, metric: Metric) -> Difference | N
         return None
     clips = entry.per_clip(metric)
     base = reference.per_clip(metric)
+    intervals = []
     interval = None
     if clips is not None and base is not None and clips.shape[1] == base.shape[1]:
         interval = paired_bootstrap(clips, base, statistic=metric.statistic)
+        intervals.append(interval)
     test = None
     if not entry.suffix and not reference.suffix:
         test = welch(np.array(seeds), np.array(others))
-    return Difference(interval, test, _finding(interval, test, metric))
-
-
-def _finding(interval: Estimate | None, test: TTest | None, metric: Metric) -> Finding:
-    intervals = []
-    if interval is not None:
-        intervals.append(interval)
     if test is not None:
         intervals.append(test.difference)
-    if intervals and all(each.value == each.low == each.high == 0 for each in intervals):
-        return "same"
     verdicts = {verdict(each, metric.better) for each in intervals}
-    if len(verdicts) != 1:
-        return "cannot tell"
-    found: dict[Verdict, Finding] = {"holds": "better", "does not hold": "worse", "cannot tell": "cannot tell"}
-    return found[verdicts.pop()]
+    finding: Finding = "cannot tell"
+    if intervals and all(each.value == each.low == each.high == 0 for each in intervals):
+        finding = "same"
+    elif len(verdicts) == 1:
+        found: dict[Verdict, Finding] = {"holds": "better", "does not hold": "worse"}
+        finding = found.get(verdicts.pop(), "cannot tell")
+    return Difference(interval, test, finding)
