@@ -95,7 +95,15 @@ def read_state(session: Session, text: object) -> Saved:
     Raises:
         Refused: the text is damaged, of another run or another version, or exceeds the limits of a session.
     """
-    values = _unpacked(text)
+    try:
+        if not isinstance(text, str):
+            raise ValueError("no text")
+        packed = base64.b64decode(text + "=" * (-len(text) % 4), b"-_", validate=True)
+        values = parse_json(zlib.decompressobj().decompress(packed, MOST_JSON))
+        if not isinstance(values, dict):
+            raise ValueError("no object")
+    except (ValueError, binascii.Error, zlib.error) as error:
+        raise Refused("bad_state", "the link is damaged: a part of it is missing or changed") from error
     try:
         if values["version"] != VERSION:
             raise Refused("bad_state", f"the link is of version {values['version']!r:.20}, this server's is {VERSION}")
@@ -120,20 +128,6 @@ def read_state(session: Session, text: object) -> Saved:
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise Refused("bad_state", "the link is damaged") from error
     return Saved(start, seed, settings, branches, lanes)
-
-
-def _unpacked(text: object) -> dict[str, Any]:
-    try:
-        if not isinstance(text, str):
-            raise ValueError("no text")
-        packed = base64.b64decode(text + "=" * (-len(text) % 4), b"-_", validate=True)
-        plain = zlib.decompressobj().decompress(packed, MOST_JSON)
-        values = parse_json(plain)
-        if not isinstance(values, dict):
-            raise ValueError("no object")
-    except (ValueError, binascii.Error, zlib.error) as error:
-        raise Refused("bad_state", "the link is damaged: a part of it is missing or changed") from error
-    return values
 
 
 def _start(session: Session, values: dict[str, Any]) -> Start:

@@ -69,9 +69,16 @@ class Sources:
         acting = self.acting.get(branch.number)
         if acting is None or acting.kind != kind or acting.last is not branch.nodes[-1]:
             try:
-                acting = self.acting[branch.number] = Acting(kind, self._actor(kind, session, branch))
+                if kind == "policy":
+                    assert self.run.policy is not None
+                    act = self.run.policy.actor(session.seed)
+                else:
+                    settings = PlanSettings(PLANNER, methods=("cem",), energy=_energy(self.run))
+                    planner = actors(self.run.trained, self.run.data.run, settings)["cem"]
+                    act = planner(session.seed, branch.nodes[0].state.rgb)
             except UserError as error:
                 raise Refused("no_source", str(error)) from error
+            acting = self.acting[branch.number] = Acting(kind, act)
         state = branch.nodes[-1].state
         seen = {"rgb": state.rgb[None]}
         if session.has_depth and (depth := session.engine.branching(True).depth(state)) is not None:
@@ -83,14 +90,6 @@ class Sources:
         acting = self.acting.get(branch.number)
         if acting is not None and source is not None and source["kind"] == acting.kind:
             acting.last = branch.nodes[-1]
-
-    def _actor(self, kind: str, session: Session, branch: Branch) -> Actor:
-        if kind == "policy":
-            assert self.run.policy is not None
-            return self.run.policy.actor(session.seed)
-        settings = PlanSettings(PLANNER, methods=("cem",), energy=_energy(self.run))
-        planner = actors(self.run.trained, self.run.data.run, settings)["cem"]
-        return planner(session.seed, branch.nodes[0].state.rgb)
 
 
 def reasons(run: PlayRun) -> dict[str, str]:
