@@ -27,7 +27,15 @@ from rsjax.tools.policies.judges.judge import frames_of, judge_key
 from rsjax.tools.policies.judges.judge_training import FOLDER
 from rsjax.tools.policies.judges.trained_judge import load_judge
 from rsjax.tools.policies.judges.validation import markdown, summary
-from rsjax.tools.policies.planning import energies
+from rsjax.tools.policies.planning.energies import (
+    Seen,
+    imagined,
+    judged,
+    lpips_distance,
+    pixel_distance,
+    success,
+    token_distance,
+)
 from rsjax.tools.policies.planning.planner import Energy, Planner, PlannerConfig
 from rsjax.tools.policies.policy import Policy
 from rsjax.tools.policies.studies.trials import FPS
@@ -104,7 +112,7 @@ class PlanningActor:
             depth = np.stack([each["depth"] for each in frames])
         else:
             depth = None
-        seen = energies.Seen(np.stack([each["rgb"] for each in frames]), depth, np.stack(self._actions[-kept:]))
+        seen = Seen(np.stack([each["rgb"] for each in frames]), depth, np.stack(self._actions[-kept:]))
         action = self._planner(seen).astype(np.float32)
         self._actions.append(action)
         self.seconds.append(time.monotonic() - began)
@@ -119,15 +127,15 @@ def energy_of(trained: TrainedModel, run: Path, settings: PlanSettings, goal: UI
             missing or damaged.
     """
     if settings.energy == "success":
-        return energies.success(trained)
+        return success(trained)
     if settings.energy == "judge":
         judge = load_judge(run / FOLDER, len(goal))
-        return energies.imagined(trained, energies.judged(judge), frames_of(judge))
+        return imagined(trained, judged(judge), frames_of(judge))
     if settings.energy == "tokens":
-        return energies.imagined(trained, energies.token_distance(trained, goal))
+        return imagined(trained, token_distance(trained, goal))
     if settings.energy == "pixels":
-        return energies.imagined(trained, energies.pixel_distance(goal))
-    return energies.imagined(trained, energies.lpips_distance(Path(settings.lpips_weights), goal))
+        return imagined(trained, pixel_distance(goal))
+    return imagined(trained, lpips_distance(Path(settings.lpips_weights), goal))
 
 
 def actors(
@@ -175,7 +183,7 @@ def actors(
     return ways
 
 
-def _proposals(policy: Policy, count: int, seed: int, seen: energies.Seen) -> Float32[np.ndarray, "N F A"]:
+def _proposals(policy: Policy, count: int, seed: int, seen: Seen) -> Float32[np.ndarray, "N F A"]:
     """Returns a policy's plans for what a planner has seen, with other draws at each frame."""
     return policy.plans(seen.rgb, count, zlib.crc32(seen.rgb.tobytes(), seed) >> 1)
 
