@@ -55,7 +55,13 @@ class WorldModelValidation:
         clips = self._clips
         prompt = clips.video.frames(0, cfg.prompt_frames)
         made = self._model.generate(weights, self._assets, prompt, clips.actions, index=clips.index)
-        scores = _watched(clips, made, cfg.prompt_frames)
+        scores = {}
+        scene = Scene(clips.metric_video, made, cfg.prompt_frames)
+        for metric in metrics().values():
+            if metric.watch and metric.function is not None:
+                with suppress(Unavailable):
+                    scored = metric.function(scene)
+                    scores[metric.name] = float(np.mean(scored[""] if isinstance(scored, dict) else scored))
         pictures = {}
         for row, number in enumerate(clips.index[:REPORT_CLIPS]):
             depth = made.depth[row] if made.depth is not None and clips.has_depth[row] else None
@@ -70,10 +76,10 @@ class WorldModelValidation:
             )
             pictures[f"clip_{number:03d}"] = filmstrip(figure)
         scalars = {f"validation/{name}": value for name, value in (loss | scores).items()}
-        metric = loss["loss"]
+        decides = loss["loss"]
         if cfg.train.early_stop is not None:  # the loss rises long before the videos get worse
-            metric = -scores.get("psnr_motion", scores["psnr"])
-        return Validation(metric, scalars, pictures)
+            decides = -scores.get("psnr_motion", scores["psnr"])
+        return Validation(decides, scalars, pictures)
 
     @cached_property
     def _model(self) -> WorldModel[Any]:
@@ -102,18 +108,6 @@ def held_out(store: Store) -> str:
     if "validation" in store.splits:
         return "validation"
     return "test"
-
-
-def _watched(clips: Clips, made: Video, prompt_frames: int) -> dict[str, float]:
-    """Computes the metrics whose ``watch`` is set."""
-    scores = {}
-    scene = Scene(clips.metric_video, made, prompt_frames)
-    for metric in metrics().values():
-        if metric.watch and metric.function is not None:
-            with suppress(Unavailable):
-                scored = metric.function(scene)
-                scores[metric.name] = float(np.mean(scored[""] if isinstance(scored, dict) else scored))
-    return scores
 
 
 @dataclass(frozen=True)
