@@ -71,7 +71,7 @@ class Sources:
             try:
                 if kind == "policy":
                     assert self.run.policy is not None
-                    act = self.run.policy.actor(session.seed)
+                    act: Actor = self.run.policy.actor(session.seed)
                 else:
                     settings = PlanSettings(PLANNER, methods=("cem",), energy=_energy(self.run))
                     planner = actors(self.run.trained, self.run.data.run, settings)["cem"]
