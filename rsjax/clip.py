@@ -35,6 +35,7 @@ class Clip:
         success: the simulator's success predicate at each frame.
         task: the robot's task, in words; ``unknown`` if the data set does not say.
         provenance: the clip's origin (source, seed, episode, camera, expert's settings …), JSON-ready.
+        second: the same frames seen by a second camera, of the same size; None: there is none.
     """
 
     rgb: UInt8[np.ndarray, "T H W 3"]
@@ -45,6 +46,7 @@ class Clip:
     success: Bool[np.ndarray, " T"]
     task: str
     provenance: dict[str, Any] = field(default_factory=dict)
+    second: UInt8[np.ndarray, "T H W 3"] | None = None
 
 
 @dataclass(frozen=True)
@@ -57,12 +59,14 @@ class Video:
         tasks: the robot's task in each clip, in words; None: unknown.
         state: a column for each of :data:`rsjax.data.state_labels.STATE`, NaN where unknown: of recorded clips the
             labels, of generated ones what the model's state heads read, with the probability of success. None: neither.
+        second: the same frames seen by a second camera. None: there is none.
     """
 
     rgb: UInt8[np.ndarray, "B T H W 3"]
     depth: Float32[np.ndarray, "B T H W"] | None = None
     tasks: Shaped[np.ndarray, " B"] | None = None
     state: Float32[np.ndarray, "B T 3"] | None = None
+    second: UInt8[np.ndarray, "B T H W 3"] | None = None
 
     @property
     def has_depth(self) -> Bool[np.ndarray, " B"]:
@@ -77,10 +81,10 @@ class Video:
 
     def __getitem__(self, rows: Any) -> "Video":
         """Returns some of the clips: ``rows`` is an array of numbers, a mask or a slice."""
-        parts = (None if x is None else x[rows] for x in (self.depth, self.tasks, self.state))
+        parts = (None if x is None else x[rows] for x in (self.depth, self.tasks, self.state, self.second))
         return Video(self.rgb[rows], *parts)
 
     def frames(self, first: int, last: int | None = None) -> "Video":
         """Returns frames ``first`` to ``last`` - 1 of every clip."""
-        depth, state = (None if x is None else x[:, first:last] for x in (self.depth, self.state))
-        return Video(self.rgb[:, first:last], depth, self.tasks, state)
+        depth, state, second = (None if x is None else x[:, first:last] for x in (self.depth, self.state, self.second))
+        return Video(self.rgb[:, first:last], depth, self.tasks, state, second)

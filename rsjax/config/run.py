@@ -9,7 +9,7 @@ from rsjax.config.data import ClipShape, DataConfig
 from rsjax.config.fields import check_numbers, require, require_range
 from rsjax.config.model import ModelConfig, converted
 from rsjax.config.sim import SimConfig
-from rsjax.config.token_model import RoboScapeConfig
+from rsjax.config.token_model import RoboScapeConfig, TokenModelConfig
 from rsjax.config.tokenizer import TokenizerConfig, TokenizerTrainConfig
 from rsjax.config.train import LoopConfig, RuntimeConfig, TrainConfig
 
@@ -121,6 +121,11 @@ class Config:
         if self.model.uses_tokenizer and self.autoencoder is self.tokenizer:
             self.tokenizer.grid(clips.image_size)
         self.model.check(clips)
+        require(
+            not self.second_view or isinstance(self.model, TokenModelConfig),
+            f"sim.second_view is {self.sim.second_view}, but models of the family {self.model.family} read one view; "
+            f"switch it off",
+        )
 
     def loop(self, stage: Literal["tokenizer", "world_model"]) -> LoopConfig:
         """Returns the settings of a stage's training loop."""
@@ -139,6 +144,11 @@ class Config:
     def clips(self) -> ClipShape:
         """The shape of the clips that the run learns from."""
         return self.sim.clips if self.data is None else self.data.clips
+
+    @property
+    def second_view(self) -> bool:
+        """Whether the model learns from a second view of the clips."""
+        return self.data is None and self.sim.second_view != "off"
 
     @property
     def autoencoder(self) -> Any:

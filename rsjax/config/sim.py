@@ -49,6 +49,8 @@ class SimConfig:
     # What the training episodes show, each with its share: expert, grasps, pushes, slips, driving, novices, or
     # recorded:PATH, such as expert=0.6 grasps=0.4. The test split is the expert's, whatever the recipe.
     recipe: tuple[str, ...] = later((EXPERT,))
+    # wrist: each frame also has the picture of the camera on the Panda's hand, of the same size, without depth.
+    second_view: Literal["off", "wrist"] = later("off")
 
     def __post_init__(self) -> None:
         require(self.frames >= 2, f"sim.frames is {self.frames}; a clip needs at least 2 frames")
@@ -69,6 +71,10 @@ class SimConfig:
                 scene = {"metaworld": "Meta-World"}.get(self.env, self.env)
                 require(task in known, f"sim.{field} names {task!r}, no task of {scene}{did_you_mean(task, known)}")
         require(self.env != "metaworld" or self.camera != "agentview", _NO_AGENTVIEW)
+        require(
+            self.env != "metaworld" or self.second_view == "off",
+            f"sim.second_view is {self.second_view}, but Meta-World's arm has no such camera here; leave it off",
+        )
         both = sorted(set(self.train_tasks) & set(self.held_out_tasks))
         require(
             not both, f"sim.unseen_tasks has {', '.join(both)}, which sim.tasks trains on; a task is seen or unseen"

@@ -27,7 +27,8 @@ from rsjax.files import checked_path, disk_guard, making
 MOST_FPS = 10_000.0  # more is a mistake, not a camera
 TRACKS = 256  # number of empty tracks of a clip without tracks
 _LABELS = ("difficulty", "scene", "segment", "skill")
-_FIELDS = (*(field.name for field in dataclasses.fields(Clip)), "episode", "fps", *_LABELS)
+_ONE_VIEW = [field.name for field in dataclasses.fields(Clip) if field.name != "second"]
+_FIELDS = (*_ONE_VIEW, "episode", "fps", *_LABELS)
 
 
 @dataclasses.dataclass

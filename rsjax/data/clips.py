@@ -27,6 +27,7 @@ class Clips:
         has_depth: whether a clip has depth.
         state: as of :func:`rsjax.data.state_labels.state_labels`.
         metric: whether a clip's depth is in metres rather than relative (see ``tools/ingest/annotators/depth.py``).
+        second: None unless all clips have a second view.
     """
 
     index: Int[np.ndarray, " B"]
@@ -40,6 +41,7 @@ class Clips:
     success: Bool[np.ndarray, "B T"]
     state: Float32[np.ndarray, "B T 3"]
     task: tuple[str, ...]
+    second: UInt8[np.ndarray, "B T H W 3"] | None = None
 
     @classmethod
     def stacked(cls, records: Sequence[Record], index: Sequence[int]) -> "Clips":
@@ -51,7 +53,11 @@ class Clips:
         none = np.zeros(records[0]["rgb"].shape[:3], np.float32)
         has = np.array([record["depth"] is not None for record in records])
         metres = [record["provenance"].get("depth_unit", "metres") == "metres" for record in records]
+        second = None
+        if all("second" in record for record in records):
+            second = np.stack([record["second"] for record in records])
         return cls(
+            second=second,
             index=np.array(index),
             depth=np.stack([none if record["depth"] is None else record["depth"] for record in records]),
             has_depth=has,
@@ -64,13 +70,15 @@ class Clips:
     def first(self, frames: int) -> "Clips":
         """Returns the clips cut to their first frames."""
         whole = {name: getattr(self, name)[:, :frames] for name in ("rgb", "depth", "actions", "success", "state")}
+        if self.second is not None:
+            whole["second"] = self.second[:, :frames]
         return replace(self, tracks=self.tracks[:, :, :frames], visible=self.visible[:, :, :frames], **whole)
 
     @property
     def video(self) -> Video:
         """Frames and depth; NaN in clips without depth."""
         if not self.has_depth.any():
-            return Video(self.rgb, None, np.array(self.task), self.state)
+            return Video(self.rgb, None, np.array(self.task), self.state, self.second)
         return self._video(self.has_depth)
 
     @property
@@ -80,7 +88,7 @@ class Clips:
 
     def _video(self, has_depth: Bool[np.ndarray, " B"]) -> Video:
         depth = np.where(has_depth[:, None, None, None], self.depth, np.float32(np.nan))
-        return Video(self.rgb, depth, np.array(self.task), self.state)
+        return Video(self.rgb, depth, np.array(self.task), self.state, self.second)
 
 
 def spread(source: Sized, count: int) -> list[int]:

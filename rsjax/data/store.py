@@ -40,8 +40,11 @@ class RecordSource(Protocol):
 
 
 def encode_clip(clip: Clip) -> Record:
-    """Returns a clip as a record."""
-    return {field.name: getattr(clip, field.name) for field in dataclasses.fields(Clip)}
+    """Returns a clip as a record, in which a second view that the clip lacks is left out."""
+    record = {field.name: getattr(clip, field.name) for field in dataclasses.fields(Clip)}
+    if clip.second is None:
+        del record["second"]
+    return record
 
 
 class Source:

@@ -39,8 +39,13 @@ class Codec:
     normalization: Normalization
 
     def encode(self, video: Video) -> Tokens:
-        """Returns a video's tokens; "depth" only if a clip has depth, with zeros for clips without."""
+        """Returns a video's tokens; "depth" only if a clip has depth, with zeros for clips without.
+
+        "second" are the tokens of the second view, if there is one.
+        """
         tokens = {"rgb": self.encode_rgb(video.rgb)}
+        if video.second is not None:
+            tokens["second"] = self.encode_rgb(video.second)
         has_depth = video.has_depth
         if video.depth is not None and has_depth.any():
             grid = self.encode_depth(video.depth[has_depth])
@@ -51,11 +56,14 @@ class Codec:
     def decode(self, tokens: Mapping[str, Grids], has_depth: Bool[np.ndarray, " B"]) -> Video:
         """Decodes tokens or codes to a video, with depth for the clips that have it and NaN for the others."""
         rgb = self.decode_rgb(tokens["rgb"])
+        second = None
+        if "second" in tokens:
+            second = self.decode_rgb(tokens["second"])
         if "depth" not in tokens or not has_depth.any():
-            return Video(rgb)
+            return Video(rgb, second=second)
         metres = np.full(rgb.shape[:-1], np.nan, np.float32)
         metres[has_depth] = self.decode_depth(np.asarray(tokens["depth"])[has_depth])
-        return Video(rgb, metres)
+        return Video(rgb, metres, second=second)
 
     def encode_rgb(self, frames: UInt8[np.ndarray, "*B H W 3"]) -> Int[np.ndarray, "*B h w"]:
         """Encodes frames 0–255."""

@@ -166,16 +166,21 @@ def _listed(path: Path, clips: Store, max_damaged: float, place: Path) -> Store:
 
 
 def token_record(codec: Codec, clip: Record) -> Record:
-    """Returns a clip's token record; depth is None if the clip has none."""
-    return {
+    """Returns a clip's token record; depth is None if the clip has none, and "second" is left out."""
+    record = {
         "rgb": codec.encode_rgb(clip["rgb"]),
         "depth": None if clip["depth"] is None else codec.encode_depth(clip["depth"]),
         **described(clip),
     }
+    if "second" in clip:
+        record["second"] = codec.encode_rgb(clip["second"])
+    return record
 
 
 def shifted_tokens(codec: Codec, clip: Record, count: int, pixels: int) -> Record:
     """Returns the tokens of a clip's moved copies; the moves depend only on the clip's pixels.
+
+    The second view does not move with the first.
 
     Returns:
         ``shifts``, the moves to the right and down in widths of the image (count, 2), and ``rgb_shifted`` and

@@ -239,6 +239,8 @@ def read_tokenizer_config(directory: Path) -> TokenizerConfig:
 class TokenizerImages:
     """The loader's transform: draws random frames of a clip, some of them as colourised depth.
 
+    Half of the others are frames of the second view, if the clip has one.
+
     Attributes:
         count: frames per clip.
         depth_share: probability that a frame is replaced by its depth map; 0 for clips without depth.
@@ -260,6 +262,9 @@ class TokenizerImages:
             near, far = record["provenance"]["depth_range"]
             colors = depth_to_color(record["depth"][chosen[as_depth]], near, far, self.scale)
             images[as_depth] = colors.astype(np.uint8)
+        if "second" in record:
+            as_second = ~as_depth & (rng.random(self.count) < 0.5)
+            images[as_second] = record["second"][chosen[as_second]]
         if self.flip:
             mirrored = rng.random(self.count) < 0.5
             images[mirrored] = images[mirrored, :, ::-1]

@@ -15,6 +15,7 @@ from rsjax.config import (
 )
 from rsjax.config.token_model import check_sampling
 from rsjax.models.roboscape.departures.integrated_actions import action_inputs
+from rsjax.models.roboscape.departures.second_view import SECOND
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,8 @@ class Architecture(TransformerConfig):
             (:mod:`rsjax.models.roboscape.departures.motion_head`).
         state_heads: whether success, height and opening are read from the features
             (:mod:`rsjax.models.roboscape.departures.state_heads`).
+        second_view: whether the RGB branch also reads tokens of a second view, and a head on it predicts them
+            (:mod:`rsjax.models.roboscape.departures.second_view`).
         feature_dtype: of the features between layers; :func:`rsjax.models.roboscape.transformer.run_transformer` sets
             it, and :func:`rsjax.models.roboscape.sample.written_out`.
     """
@@ -52,6 +55,7 @@ class Architecture(TransformerConfig):
     depth_cells: int = 1
     motion_head: bool = False
     state_heads: bool = False
+    second_view: bool = False
     feature_dtype: Literal["float32", "bfloat16"] = "float32"
 
     def __post_init__(self) -> None:
@@ -95,6 +99,7 @@ class Architecture(TransformerConfig):
             depth_cells=small.cells,
             motion_head=model.keypoint_term == "motion",
             state_heads=model.state_heads is not None,
+            second_view=config.second_view,
         )
 
     @property
@@ -105,15 +110,13 @@ class Architecture(TransformerConfig):
     @property
     def modalities(self) -> tuple[str, ...]:
         """Names of what the network predicts."""
-        if self.depth == "none":
-            return ("rgb",)
-        return ("rgb", "depth")
+        return ("rgb", *["depth"] * (self.depth != "none"), *[SECOND] * self.second_view)
 
     @property
     def inputs(self) -> tuple[str, ...]:
         """Names of the modalities whose tokens the network reads."""
         if self.depth == "head" and not self.reads_depth:
-            return ("rgb",)
+            return tuple(name for name in self.modalities if name != "depth")
         return self.modalities
 
     @property
@@ -125,7 +128,7 @@ class Architecture(TransformerConfig):
 
     def sizes(self, modality: str) -> "Architecture":
         """Returns the architecture with width, heads, blocks and grid of the branch that reads a modality."""
-        if modality == "rgb":
+        if modality != "depth":
             return self
         width = self.depth_width or self.width
         return replace(

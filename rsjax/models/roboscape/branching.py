@@ -26,6 +26,7 @@ from rsjax.models.branch_states import BranchState, Decoding
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.departures import mean_codes
 from rsjax.models.roboscape.departures.keep_still import keep_still
+from rsjax.models.roboscape.departures.second_view import views
 from rsjax.models.roboscape.sample import State, start, step, with_few_launches
 from rsjax.models.roboscape.transformer import Cache
 from rsjax.tokenizers.codec import Codec
@@ -79,7 +80,7 @@ class TokenBranching:
         self._place = partial(jax.device_put, device=where)
 
     def begin(self, first: Video) -> BranchState:
-        video = first if self._has_depth else Video(first.rgb)
+        video = views(first, self._has_depth, self._arch.second_view)
         grids = self._codec.encode(video)
         cells = {branch: jnp.asarray(grid.reshape(1, 1, -1), jnp.int32) for branch, grid in grids.items()}
         if self._arch.depth != "none":
@@ -181,7 +182,7 @@ class TokenBranching:
 
     def _branch_state(self, memory: _Memory, rgb: UInt8[np.ndarray, "H W 3"]) -> BranchState:
         state = memory.state
-        branches = self._arch.modalities if self._has_depth else ("rgb",)
+        branches = [name for name in self._arch.modalities if name != "depth" or self._has_depth]
         tokens = {branch: np.asarray(state.tokens[branch][0, -1]) for branch in branches}
         means = {branch: np.asarray(cells[0, -1]) for branch, cells in state.means.items() if branch in branches}
         assert state.entropy is not None

@@ -23,6 +23,7 @@ from rsjax.devices import on_cpu
 from rsjax.layers.unstacked_params import unstack_params
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.departures.keep_still import keep_still
+from rsjax.models.roboscape.departures.second_view import views
 from rsjax.models.roboscape.sample import (
     CLIPS,
     State,
@@ -83,7 +84,7 @@ class TokenImagination:
         self._decoded = np.zeros_like(self._first)
 
     def restart(self, which: Bool[np.ndarray, " B"], first: Video, index: Int[np.ndarray, " N"]) -> Video:
-        video = first if self._has_depth else Video(first.rgb)
+        video = views(first, self._has_depth, self._arch.second_view)
         grids = self._codec.encode(video)
         count = len(which)
         rows = np.zeros(count, int)  # of all clips; those that go on take any

@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Int, Key
 from rsjax.clip import Array
 from rsjax.config import SampleConfig
 from rsjax.models.roboscape.departures import mean_codes
+from rsjax.models.roboscape.departures.second_view import SECOND
 from rsjax.tokenizers import lfq
 
 
@@ -98,7 +99,7 @@ def unmask_step(
     """Does one decoding step: fills the masked cells, then masks some of them again as the schedule says.
 
     Both branches share their mask. The cells that are masked again are random or, for "greedy", those of lowest
-    confidence, which is the sum of both branches' log-probabilities, or RGB's alone for a clip without depth.
+    confidence, which is the sum of all branches' log-probabilities, without depth's for a clip without depth.
 
     Args:
         keys: one per clip.
@@ -120,7 +121,8 @@ def _unmask_clip(
     temperature: float | Array | None,
 ) -> Frame:
     order_key, rgb_key, depth_key = jax.random.split(key, 3)
-    branch_keys = {"rgb": rgb_key, "depth": depth_key}  # RGB's draws are the same where depth is left out
+    # RGB's draws are the same where the others are left out.
+    branch_keys = {"rgb": rgb_key, "depth": depth_key, SECOND: jax.random.fold_in(key, 3)}
     tokens = {}
     confidence = jnp.zeros(frame.mask.shape)
     entropy = frame.entropy

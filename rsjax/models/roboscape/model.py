@@ -15,12 +15,12 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from rsjax.clip import Video
 from rsjax.config import ClipShape, Config, RoboScapeConfig, TokenizerConfig, TokenModelConfig
-from rsjax.data.clips import readable, spread
+from rsjax.data.clips import first_clip, readable, spread
 from rsjax.data.codec import Record
 from rsjax.data.loader import Arrays, Transform
 from rsjax.data.normalization import Normalization
 from rsjax.data.state_labels import knows_success, missing_labels
-from rsjax.data.store import Store
+from rsjax.data.store import Store, StoreError
 from rsjax.devices import divide
 from rsjax.models.base import Assets, TeacherForced, WorldModel, implements
 from rsjax.models.roboscape import masking, objective, pretrained, records
@@ -30,6 +30,7 @@ from rsjax.models.roboscape.departures import state_heads
 from rsjax.models.roboscape.departures.action_dropout import dropped_actions
 from rsjax.models.roboscape.departures.keep_still import keep_still
 from rsjax.models.roboscape.departures.motion_head import MotionHead
+from rsjax.models.roboscape.departures.second_view import SECOND, views
 from rsjax.models.roboscape.departures.self_conditioning import conditions_itself, previous_frames
 from rsjax.models.roboscape.departures.whole_frames import hidden
 from rsjax.models.roboscape.flops import forward_flops, motion_head_flops
@@ -72,7 +73,7 @@ class RoboScape(WorldModel[Batch]):
 
     @property
     def loss_weights(self) -> dict[str, float]:
-        return self.config.loss_weights
+        return objective.loss_weights(self.config, self.architecture)
 
     def init(self, key: Key[Array, ""]) -> Params:
         return Transformer(self.architecture).init_params(key)
@@ -138,20 +139,27 @@ class RoboScape(WorldModel[Batch]):
 
     def prepare(self, clips: Store, assets: Assets, folder: Path, max_damaged: float) -> Store:
         """Makes every clip's tokens and stores them next to the clips, for all runs with this tokenizer and shifts."""
+        if self.architecture.second_view and SECOND not in first_clip(clips):
+            raise StoreError(
+                f"{clips.path}: its clips have no second view; simulate them with sim.second_view, or leave it off"
+            )
         codec = self._codec(assets)
         shifts = self.config.token_shifts
         return tokenize_store(clips, codec, self.clips.image_size, folder, max_damaged, shifts)
 
     def transform(self, normalization: Normalization) -> Transform:
         integrate = self.config.departures.integrate_actions
-        return partial(records.token_arrays, normalization, integrate, state=self.architecture.state_heads)
+        arch = self.architecture
+        return partial(
+            records.token_arrays, normalization, integrate, state=arch.state_heads, second_view=arch.second_view
+        )
 
     def batch(self, arrays: Arrays) -> Batch:
         return records.token_batch(arrays)
 
     def example(self, rng: np.random.Generator) -> Record:
         arch = self.architecture
-        return records.random_record(rng, self.clips, arch.grid, arch.code_bits)
+        return records.random_record(rng, self.clips, arch.grid, arch.code_bits, arch.second_view)
 
     def generate(
         self,
@@ -258,7 +266,7 @@ class RoboScape(WorldModel[Batch]):
 
     def _tokens(self, assets: Assets, video: Video, arch: Architecture) -> tuple[Tokens, np.ndarray]:
         """Returns a video's tokens by branch (depth if network and a clip have it), and which clips have depth."""
-        seen = video if arch.depth != "none" else Video(video.rgb)
+        seen = views(video, arch.depth != "none", arch.second_view)
         return {branch: jnp.asarray(grid) for branch, grid in self._codec(assets).encode(seen).items()}, seen.has_depth
 
     def _action_inputs(self, assets: Assets, actions: Float[np.ndarray, "B T A"]) -> Float[Array, "B T A2"]:

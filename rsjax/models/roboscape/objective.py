@@ -21,6 +21,7 @@ from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.departures.keypoint_terms import other_keypoint_term
 from rsjax.models.roboscape.departures.normalised_attention import normalised
 from rsjax.models.roboscape.departures.observed_anchor import anchor
+from rsjax.models.roboscape.departures.second_view import SECOND, WEIGHT
 from rsjax.models.roboscape.departures.visible_keypoints import counted_frames
 from rsjax.tokenizers import lfq
 from rsjax.trainable import Term
@@ -41,6 +42,7 @@ class Batch:
         index: the clip's place in the global batch, which decides its random masks whichever device it is on.
         has_depth: 1 for a clip with depth, 0 for one without, whose depth tokens are zeros and never read; None: all
             clips have depth.
+        second: token of each cell of the second view; None: the clips have none.
         state: the labels of the state heads (:func:`rsjax.data.state_labels.state_labels`); None: the model has none.
     """
 
@@ -53,6 +55,7 @@ class Batch:
     index: Int32[clip.Array, " B"]
     has_depth: Float[clip.Array, " B"] | None = None
     state: Float[clip.Array, "B T 3"] | None = None
+    second: Int32[clip.Array, "B T H W"] | None = None
 
 
 @struct.dataclass
@@ -99,6 +102,9 @@ def loss_terms(
             clips = clips * batch.has_depth
         masked_depth = mask * clips[:, None, None, None]
         terms["depth"] = jnp.sum(depth_nats * masked_depth), jnp.sum(masked_depth)
+    if SECOND in logits:
+        second_nats = lfq.token_cross_entropy(logits[SECOND], targets[SECOND], bits)
+        terms[SECOND] = jnp.sum(second_nats * masked), jnp.sum(masked)
 
     if isinstance(config, RoboScapeConfig) and config.loss.keypoints != "none":
         # T_sample: the K tracks of the largest M_i, on the token grid.
@@ -124,8 +130,16 @@ def loss_terms(
         else:
             terms["attention"] = normalised(nats, attention, masked)
 
-    weights = config.loss_weights
+    weights = loss_weights(config, architecture)
     return {name: term for name, term in terms.items() if name in weights}
+
+
+def loss_weights(config: TokenModelConfig, architecture: Architecture) -> dict[str, float]:
+    """Returns the weight of each term that is on by name."""
+    weights = dict(config.loss_weights)
+    if architecture.second_view:
+        weights[SECOND] = WEIGHT
+    return weights
 
 
 def keypoint_distance(

@@ -16,6 +16,7 @@ from rsjax.config.fields import differences
 from rsjax.errors import UserError
 from rsjax.model_directory import has_weights, read_settings
 from rsjax.models.roboscape.architecture import Architecture
+from rsjax.models.roboscape.departures.second_view import SECOND
 from rsjax.models.roboscape.transformer import Transformer
 from rsjax.models.saved import check_family
 from rsjax.trainable import Params
@@ -26,6 +27,7 @@ ALIKE = {"read_previous", "whole_frames", "rotary", "more_norms"}
 JOINING: tuple[str, ...] = ("blocks/depth_to_rgb/", "action_encoder/", "action_encoder_fc2/", "null_action")
 ADAPTIVE = "/action_norms/"
 HEAD_JOINING = ("depth_embed/", "depth_previous_embed/")
+SECOND_JOINING = (f"{SECOND}_embed/", f"{SECOND}_previous_embed/")
 OPTIONAL = {"motion_head", "state_heads"}  # parameters that are left out where this model lacks them
 # Fields that may differ.
 FREE = {"action_encoder", "action_inputs", "motion_head", "state_heads", "departures"} | {
@@ -72,6 +74,8 @@ def shapes(own: Architecture, directory: Path) -> Params:
         alike = ALIKE | {"integrate_actions"}
     if saved.depth == "none":
         free = free | {"depth", "reads_depth", "depth_width", "depth_blocks", "depth_cells"}
+    if not saved.second_view:
+        free = free | {"second_view"}
     other = {field.name for field in fields(Departures)} - alike
     differing = "; ".join(
         filter(None, [differences(saved, own, free), differences(saved.departures, own.departures, other)])
@@ -85,9 +89,9 @@ def start(fresh: Params, saved: Params, directory: Path) -> Params:
     """Returns the parameters that training begins with: the saved ones, unchanged, completed by fresh ones.
 
     What joins the RGB branch begins at zero: the depth → RGB projection or, with a depth head, the embeddings of depth,
-    and the action encoder's last layer, or what adaptive norms read from it. So RGB logits are at first those of the
-    saved model. A saved action encoder is kept; it reads actions normalised for the new data. Saved motion or state
-    heads that this model lacks are left out.
+    those of a second view, and the action encoder's last layer, or what adaptive norms read from it. So RGB logits are
+    at first those of the saved model. A saved action encoder is kept; it reads actions normalised for the new data.
+    Saved motion or state heads that this model lacks are left out.
 
     Raises:
         UserError: this model lacks a saved array, or has it in another shape.
@@ -101,7 +105,7 @@ def start(fresh: Params, saved: Params, directory: Path) -> Params:
             raise UserError(f"{directory}: its {path} has no place in this model; keep the branches and the actions")
         if params[path].shape != own[path].shape:
             raise UserError(f"{directory}: its {path} is {params[path].shape}, this model's is {own[path].shape}")
-    joining = JOINING
+    joining = JOINING + SECOND_JOINING
     if not any(path.startswith("blocks/depth/") for path in own):
         joining += HEAD_JOINING
     if any(ADAPTIVE in path for path in own):  # a layer on an encoder of zeros would not learn

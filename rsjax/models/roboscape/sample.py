@@ -530,7 +530,7 @@ def _prompt_tokens(
     """Checks and returns the prompt's tokens of the model's modalities, and ``no_depth`` if the model needs it."""
     cells = {branch: jnp.asarray(grid, jnp.int32).reshape(*grid.shape[:2], -1) for branch, grid in prompt.items()}
     if arch.depth == "none":
-        return {"rgb": cells["rgb"]}, None
+        return {name: cells[name] for name in arch.modalities}, None
     clips = len(cells["rgb"])
     if no_depth is not None and np.shape(no_depth) != (clips,):
         raise ValueError(f"no_depth has shape {np.shape(no_depth)}; the prompt has {clips} clips, each needs one value")

@@ -33,6 +33,7 @@ from rsjax.models.roboscape.departures.motion_head import MotionHead
 from rsjax.models.roboscape.departures.norms import optional_norm
 from rsjax.models.roboscape.departures.read_previous import absent_cells, frame_before
 from rsjax.models.roboscape.departures.rotary import rotated
+from rsjax.models.roboscape.departures.second_view import SECOND
 from rsjax.models.roboscape.departures.state_heads import StateHeads
 from rsjax.models.roboscape.departures.whole_frames import hidden
 from rsjax.tokenizers import lfq
@@ -232,7 +233,7 @@ class Transformer(nn.Module):
 
     With ``config.depth`` "head" the RGB branch also reads depth tokens, and a second head on its output predicts them.
     Its modalities, what it predicts, are "rgb" and "depth", or "rgb" alone; it reads the same unless ``reads_depth`` is
-    False.
+    False. With ``second_view`` the RGB branch reads and predicts "second", too.
     """
 
     config: Architecture
@@ -303,7 +304,10 @@ class Transformer(nn.Module):
                 absent = absent_cells(name, before, start, no_depth)
                 x[name] = x[name] + self._embed(name, f"{name}_previous_embed", before, absent)
         if cfg.depth == "head" and cfg.reads_depth:
-            x = {"rgb": x["rgb"] + x["depth"]}
+            x["rgb"] = x["rgb"] + x["depth"]
+        if cfg.second_view:
+            x["rgb"] = x["rgb"] + x[SECOND]
+        x = {branch: x[branch] for branch in cfg.branches}
         x = {branch: features.astype(cfg.feature_dtype) for branch, features in x.items()}
 
         # Both branches' blocks, with Eq. 3 after each pair.

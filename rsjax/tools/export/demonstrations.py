@@ -77,7 +77,7 @@ def export_libero(
     tasks = list(OBJECTS)
     failures = 0
     number = 0
-    with new_data_set(out) as root, TabletopSim(camera="near", image_size=options.size, wrist=True) as sim:
+    with new_data_set(out) as root, TabletopSim(camera="near", image_size=options.size) as sim:
         layout = LAYOUTS[options.version](root, video, features)
         while layout.episodes < options.demos:
             sim.task = tasks[layout.episodes % len(tasks)]

@@ -113,7 +113,10 @@ class PlayRun:
             depth = clip["depth"][None, :1]
         else:
             depth = None
-        return Video(clip["rgb"][None, :1], depth)
+        second = None
+        if "second" in clip:
+            second = clip["second"][None, :1]
+        return Video(clip["rgb"][None, :1], depth, second=second)
 
     @cached_property
     def controls(self) -> Controls:

@@ -173,6 +173,8 @@ class Session:
             draw = int(start.number or 0)
         else:
             assert start.upload is not None
+            if self.run.trained.config.second_view:
+                raise Refused("bad_image", "the model reads a second view, which a picture lacks; begin with a clip")
             first = Video(start.upload.rgb[None, None])
             draw = 0
         state = await asyncio.to_thread(self.engine.begin, first)

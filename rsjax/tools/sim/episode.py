@@ -212,6 +212,7 @@ def run_episode(sim: Simulator, config: SimConfig, plan: EpisodePlan) -> Clip:
         act = _replayed(plan.replay, CONTROLS[config.env], np.random.default_rng([seed, episode, 4]))
         manner = plan.replay.expert or manner
     views = []
+    seconds = []
     shots = []
     success = []
     places = []
@@ -224,6 +225,9 @@ def run_episode(sim: Simulator, config: SimConfig, plan: EpisodePlan) -> Clip:
             sim.step(actions[frame, step])
         views.append(sim.render())
         shots.append(Snapshot(sim.camera, *sim.body_poses(), views[-1].fine_depth))
+        if config.second_view == "wrist":
+            assert isinstance(sim, panda.PandaSim)
+            seconds.append(sim.wrist_image)
         success.append(sim.success)
         places.append(sim.places)
         heights.append(sim.object_height)
@@ -249,6 +253,9 @@ def run_episode(sim: Simulator, config: SimConfig, plan: EpisodePlan) -> Clip:
         provenance["replay"] = {"jitter": plan.replay.jitter}
     if plan.change:
         provenance["unseen"] = {"what": plan.change} | to_dict(looks)
+    second = None
+    if seconds:
+        second = np.stack(seconds)
     return Clip(
         rgb=np.stack([view.rgb for view in views]),
         depth=np.stack([view.depth for view in views]),
@@ -258,6 +265,7 @@ def run_episode(sim: Simulator, config: SimConfig, plan: EpisodePlan) -> Clip:
         success=np.array(success),
         task=plan.task or (lift.ANY_TASK if plan.change == "color" else lift.TASK),
         provenance=provenance,
+        second=second,
     )
 
 

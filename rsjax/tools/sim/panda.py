@@ -7,7 +7,7 @@ from typing import Any
 from xml.etree.ElementTree import Element
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 
 from rsjax.tools.sim.base import MujocoSim, OwnCamera, choose_camera
 from rsjax.tools.sim.gl import choose_gl
@@ -18,6 +18,7 @@ CONTROL_HZ = 20
 CENTRE = (0.0, 0.0, 0.85)  # of the workspace, metres
 STEP = 0.015  # metres by which an action of 1 moves the goal: 0.3 m/s
 TURN = 0.15  # radians, likewise
+WRIST = "robot0_eye_in_hand"  # robosuite's camera on the hand
 REACH = np.array([[-0.35, -0.4, 0.8], [0.3, 0.4, 1.3]])  # bounds of the goal position, metres
 
 
@@ -74,6 +75,14 @@ class PandaSim(MujocoSim):
         self.object_bodies = np.array([self._model.body(name).id for name in objects], np.int32)
         self._scenery = Scenery(self._model, self._camera_id, self.object_bodies.tolist(), CENTRE)
         self._renderer = Renderer(self._model, self._camera_id, image_size)
+        self._image_size = image_size
+        self._wrist: Renderer | None = None  # opened when it is needed
+
+    def close(self) -> None:
+        """Frees the renderers and the simulation."""
+        if self._wrist is not None:
+            self._wrist.close()
+        super().close()
 
     def reset(self, seed: int, variation: Variation = SEEN) -> None:
         """Begins an episode; the seed (0 … 2³² - 1) determines the initial poses of the arm and the objects."""
@@ -102,6 +111,13 @@ class PandaSim(MujocoSim):
         """Returns the gripper's position in metres and its rotation in the world."""
         site = self._env.robots[0].eef_site_id
         return self._data.site_xpos[site].copy(), self._data.site_xmat[site].reshape(3, 3).copy()
+
+    @property
+    def wrist_image(self) -> UInt8[np.ndarray, "S S 3"]:
+        """Returns what the hand's camera sees."""
+        if self._wrist is None:
+            self._wrist = Renderer(self._model, self._model.camera(WRIST).id, self._image_size)
+        return self._wrist.render(self._data).rgb
 
     @property
     def fingers(self) -> Float[np.ndarray, " 2"]:

@@ -8,18 +8,16 @@ from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
 from rsjax.config.sim import TABLETOP_TASKS
 from rsjax.tools.sim.expert import CLOSE, OPEN, TABLE_HEIGHT, Arm
 from rsjax.tools.sim.panda import TURN, PandaSim, table_scene, yaw_of
 from rsjax.tools.sim.recipes.script import Moves, Scripted, go, rest, stay, towards
-from rsjax.tools.sim.render import Renderer
 from rsjax.tools.sim.scenery import SEEN, Variation
 
 # task → its object in words
 OBJECTS = dict(zip(TABLETOP_TASKS, ("red cube", "soda can", "bread", "milk carton"), strict=True))
-WRIST = "robot0_eye_in_hand"  # robosuite's camera on the hand
 # Our own camera: position and the point it looks at in metres, vertical field of view in degrees.
 NEAR = ("near", (0.85, 0.05, 1.35), (-0.02, 0.02, 0.86), 40.0)
 BASKET = np.array([0.0, 0.2])  # its place on the table, metres
@@ -56,20 +54,16 @@ class TabletopSim(PandaSim):
         task: a key of ``OBJECTS``; it may be set anew before a reset.
         camera: "near" (our own camera), or the name of one of robosuite's cameras.
         image_size: S, pixels along each side.
-        wrist: whether the hand's camera sees too.
 
     Raises:
         GLError: no OpenGL context can be made.
         ConfigError: there is no such camera.
     """
 
-    def __init__(self, task: str = "cube", camera: str = "near", image_size: int = 64, wrist: bool = False) -> None:
+    def __init__(self, task: str = "cube", camera: str = "near", image_size: int = 64) -> None:
         self.task = task
         self._sizes: list[tuple[float, float]] = []  # of each object: from its origin to its bottom, and to its top
         super().__init__(self.scene, [f"{name}_main" for name in OBJECTS], camera, NEAR, image_size)
-        self._wrist: Renderer | None = None
-        if wrist:
-            self._wrist = Renderer(self._model, self._model.camera(WRIST).id, image_size)
 
     def scene(self, robosuite: Any, settings: dict[str, Any]) -> Any:
         """Makes robosuite's environment, and notes the objects' heights."""
@@ -83,12 +77,6 @@ class TabletopSim(PandaSim):
         ]
         self._sizes = [(float(thing.bottom_offset[2]), float(thing.top_offset[2])) for thing in things]
         return table_scene(robosuite, settings, things, [basket()])
-
-    def close(self) -> None:
-        """Frees the renderers and the simulation."""
-        if self._wrist is not None:
-            self._wrist.close()
-        super().close()
 
     def draw_expert(self, rng: np.random.Generator) -> Scripted:
         """Draws an episode's manner, and returns the expert with it."""
@@ -152,12 +140,6 @@ class TabletopSim(PandaSim):
     def object_width(self) -> float:
         """Returns 5 cm, the width of a can."""
         return 0.05
-
-    @property
-    def wrist_image(self) -> UInt8[np.ndarray, "S S 3"]:
-        """Returns what the hand's camera sees."""
-        assert self._wrist is not None, "open the simulator with wrist=True"
-        return self._wrist.render(self._data).rgb
 
     @property
     def robot_state(self) -> Float[np.ndarray, " 8"]:

@@ -1,0 +1,53 @@
+"""What the camera on the hand sees beside the main camera."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rsjax.config import SimConfig, content_key
+from rsjax.data.store import encode_clip
+from rsjax.tools.sim.collect import collection_key
+from rsjax.tools.sim.episode import EpisodePlan, run_episode
+from rsjax.tools.sim.grasps import Grasp
+from rsjax.tools.sim.lift import LiftSim
+
+CONFIG = SimConfig(episodes=4, test_episodes=1, frames=8, tracks=20, seed=5)
+BOTH = replace(CONFIG, second_view="wrist")
+
+
+@pytest.fixture(scope="module")
+def plan() -> EpisodePlan:
+    return EpisodePlan("000001", 1, manner=Grasp(0.0, 0, 0.0))
+
+
+def redness(frames: np.ndarray) -> np.ndarray:
+    return (frames[..., 0].astype(int) - frames[..., 1:].max(-1) > 40).sum((1, 2))
+
+
+def test_everything_but_the_second_view_is_as_without_it(sim: LiftSim, plan: EpisodePlan) -> None:
+    """Episodes before and after one with both views are the same, so the second renderer disturbs nothing."""
+    before, both, after = (run_episode(sim, config, plan) for config in (CONFIG, BOTH, CONFIG))
+    for name, value in encode_clip(before).items():
+        for other in (both, after):
+            if name == "provenance":
+                assert getattr(other, name) == value
+            else:
+                np.testing.assert_array_equal(getattr(other, name), value, err_msg=name)
+    assert before.second is after.second is None
+
+
+def test_it_shows_the_cube_ever_larger_as_the_hand_comes_down(sim: LiftSim, plan: EpisodePlan) -> None:
+    clip = run_episode(sim, BOTH, plan)
+    assert clip.second is not None
+    assert clip.second.shape == clip.rgb.shape
+    np.testing.assert_array_equal(clip.second[-1], sim.wrist_image)
+    red = redness(clip.second)
+    assert 0 < red[0] < red[3] < red[5]
+    assert not np.array_equal(clip.second[-1], clip.rgb[-1])
+
+
+def test_clips_without_it_keep_their_key() -> None:
+    """That of commit b2aac855, before there were second views: stores of episodes are found again."""
+    assert content_key(SimConfig()) == "f2b11a4043e73092"
+    assert collection_key(BOTH) != collection_key(CONFIG)
