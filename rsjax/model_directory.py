@@ -130,11 +130,18 @@ def save_directory(
     """
     if directory.exists() and not is_saved(directory) and any(directory.iterdir()):
         raise ModelFileError(f"{directory}: holds something else than a saved model; choose another place")
+    leaves = {part: jax.tree_util.tree_flatten_with_path(params)[0] for part, params in parts.items()}
+    named = [(_name(part, keys), x) for part, flat in leaves.items() for keys, x in flat]
     tensors: dict[str, np.ndarray] = {}
-    for part, params in parts.items():
-        for keys, x in jax.tree_util.tree_flatten_with_path(params)[0]:
-            name = _name(part, keys)
-            tensors[name] = _stored(name, np.asarray(x), dtype)
+    for name, leaf in named:
+        x = np.asarray(leaf)
+        if x.dtype.kind == "f":
+            with np.errstate(over="ignore"):
+                x = x.astype(dtype)
+            if not np.isfinite(x).all():
+                raise ModelFileError(f"{name} has values that {dtype} cannot hold; save it as float32")
+        # safetensors writes memory as it lies; ascontiguousarray makes a vector of a scalar
+        tensors[name] = np.ascontiguousarray(x).reshape(x.shape)
     new = directory.absolute().with_name(f"{directory.name}.new")
     with disk_guard(directory):
         shutil.rmtree(new, ignore_errors=True)
@@ -190,13 +197,3 @@ def check_digests(directory: Path) -> None:
 
 def _name(part: Part, keys: tuple[Any, ...]) -> str:
     return "/".join([part, *(str(getattr(key, "key", getattr(key, "idx", key))) for key in keys)])
-
-
-def _stored(name: str, x: np.ndarray, dtype: Dtype) -> np.ndarray:
-    """Returns a parameter as it is stored; safetensors writes memory as it lies, so the array is contiguous."""
-    if x.dtype.kind == "f":
-        with np.errstate(over="ignore"):
-            x = x.astype(dtype)
-        if not np.isfinite(x).all():
-            raise ModelFileError(f"{name} has values that {dtype} cannot hold; save it as float32")
-    return np.ascontiguousarray(x).reshape(x.shape)  # it makes a vector of a scalar

@@ -188,22 +188,23 @@ def _statistics(stores: Sequence[Store]) -> dict[str, Any]:
     alike = all({name: manifest.get(name) for name in UNITS} == units for manifest in manifests)
     if alike and not all("action_count" in manifest for manifest in manifests):
         return units
-    total = reduce(Statistics.merged, map(_action_statistics, stores))
+    actions = []
+    for store in stores:
+        if "action_count" in store.manifest:
+            actions.append(Statistics.from_json(store.manifest))
+            continue
+        source = store.source("train")
+        if not len(source):
+            raise StoreError(
+                f"{store.path}: its train split has no records, so its actions have no statistics; leave it out"
+            )
+        own = (Statistics.of(source[n]["actions"][1:]) for n in range(len(source)))
+        actions.append(reduce(Statistics.merged, own))
+    total = reduce(Statistics.merged, actions)
     ranges = [manifest["depth_range"] for manifest in manifests if manifest.get("depth_range")]
     merged = [min(near for near, _ in ranges), max(far for _, far in ranges)] if ranges else None
     unit = next((manifest["depth_unit"] for manifest in manifests if manifest.get("depth_unit")), None)
     return total.to_json() | {"depth_range": merged, "depth_unit": unit} | (units if alike else {})
-
-
-def _action_statistics(store: Store) -> Statistics:
-    if "action_count" in store.manifest:
-        return Statistics.from_json(store.manifest)
-    source = store.source("train")
-    if not len(source):
-        raise StoreError(
-            f"{store.path}: its train split has no records, so its actions have no statistics; leave it out"
-        )
-    return reduce(Statistics.merged, (Statistics.of(source[n]["actions"][1:]) for n in range(len(source))))
 
 
 def _check_mergeable(stores: Sequence[Store], out: Path) -> None:

@@ -186,7 +186,17 @@ def _pack(what: Collection, partial: Path, out: Path) -> None:
         flat = np.concatenate(actions).astype(np.float64)
         meta |= {"depth_range": [min(depths), max(depths)]}
         meta |= {"action_mean": flat.mean(0).tolist(), "action_std": flat.std(0).tolist()}
-    meta |= _summary([path for paths in files.values() for path in paths]) | dict(what.meta)
+    tasks = set[str]()
+    modes = Counter[str]()
+    final = []
+    ever = []
+    for record in _clips([path for paths in files.values() for path in paths]):
+        tasks.add(record["task"])
+        modes[record["provenance"]["expert"]["mode"]] += 1
+        final.append(bool(record["success"][-1]))
+        ever.append(bool(record["success"].any()))
+    meta |= {"tasks": sorted(tasks), "modes": dict(modes)}
+    meta |= {"success_share": float(np.mean(final)), "success_ever_share": float(np.mean(ever))} | dict(what.meta)
     stamp = {"depth_range": meta["depth_range"]}
     splits = {
         split: (clip | {"provenance": clip["provenance"] | stamp} for clip in _clips(paths))
@@ -202,22 +212,3 @@ def labels(clip: Record) -> dict[str, str]:
 
 def _clips(paths: list[Path]) -> Iterator[Record]:
     return (decode(path.read_bytes()) for path in paths)
-
-
-def _summary(paths: list[Path]) -> dict[str, Any]:
-    """Returns manifest fields: tasks, expert modes, and the shares of clips that end in success or ever succeed."""
-    modes = Counter[str]()
-    final = []
-    ever = []
-    tasks = set[str]()
-    for record in _clips(paths):
-        tasks.add(record["task"])
-        modes[record["provenance"]["expert"]["mode"]] += 1
-        final.append(bool(record["success"][-1]))
-        ever.append(bool(record["success"].any()))
-    return {
-        "tasks": sorted(tasks),
-        "modes": dict(modes),
-        "success_share": float(np.mean(final)),
-        "success_ever_share": float(np.mean(ever)),
-    }

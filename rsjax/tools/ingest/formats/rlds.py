@@ -64,7 +64,16 @@ def open_source(
     Raises:
         SourceError: there are no shards, or the key map does not fit ``features.json``.
     """
-    shards = _shards(path)
+    shards = [path]
+    if not path.is_file():
+        shards = sorted(near(path, "*.tfrecord*"))
+        folders = sorted({shard.parent for shard in shards})
+        if not folders:
+            where = "no *.tfrecord* files here or two folders further down"
+            raise SourceError(f"{path}: {where}; give the folder with them")
+        if len(folders) > 1:
+            several = ", ".join(map(str, folders[:4]))
+            raise SourceError(f"{path}: several data sets ({several} …); give the folder of one")
     folder = shards[0].parent
     info = _read_object(folder / "dataset_info.json")
     if not 0 <= fps <= MAX_FPS:
@@ -233,19 +242,6 @@ def _texts(example: Example, keys: Sequence[str], count: int) -> list[str]:
         if any(texts):
             return texts
     return []
-
-
-def _shards(path: Path) -> list[Path]:
-    """Returns the shards at a path, all of one folder."""
-    if path.is_file():
-        return [path]
-    shards = near(path, "*.tfrecord*")
-    folders = sorted({shard.parent for shard in shards})
-    if not folders:
-        raise SourceError(f"{path}: no *.tfrecord* files here or two folders further down; give the folder with them")
-    if len(folders) > 1:
-        raise SourceError(f"{path}: several data sets ({', '.join(map(str, folders[:4]))} …); give the folder of one")
-    return sorted(shards)
 
 
 def _split_name(shard: Path) -> tuple[str, str]:
