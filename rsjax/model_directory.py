@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any, Literal, TypeAlias, TypeVar
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import safetensors.numpy
 
@@ -103,7 +102,8 @@ def load_part(directory: Path, part: Part, like: Tree) -> Tree:
         shapes = [x.shape if (x := tree.get(name)) is not None else "none" for tree in (saved, wanted)]
         if shapes[0] != shapes[1]:
             raise ModelFileError(f"{path}: {name} is {shapes[0]}, the configuration needs {shapes[1]}; {AGAIN}")
-    return jax.tree_util.tree_unflatten(structure, [jnp.asarray(saved[name], x.dtype) for name, x in wanted.items()])
+    arrays = [saved[name].astype(x.dtype) for name, x in wanted.items()]
+    return jax.device_put(jax.tree_util.tree_unflatten(structure, arrays))
 
 
 def save_directory(

@@ -31,6 +31,7 @@ patient = threading.Event()  # set while stopping after SIGTERM may take longer,
 
 CACHE_DIRECTORY = "JAX_COMPILATION_CACHE_DIR"
 CACHE_SIZE = 4 * 2**30  # bytes of compiled programs that are kept
+CACHED_SECONDS = 0.1  # a program that compiles faster is compiled again in about the time that reading it takes
 BF16_UNITS = {"avx512_bf16", "amx_bf16", "bf16"}  # as x86 and Arm processors name them
 YNNPACK = "--xla_cpu_experimental_ynn_fusion_type"  # the operations that XLA hands to this library
 TRITON_PRODUCTS = "--xla_gpu_enable_triton_gemm"
@@ -63,6 +64,25 @@ def tune_process() -> None:
         sys.stdout.flush()
     tuned = os.environ | {"GLIBC_TUNABLES": f"{tunables}:{HUGE_PAGES}".lstrip(":")}
     os.execve(sys.executable, sys.orig_argv, tuned)
+
+
+def keep_compiled_programs() -> None:
+    """Caches compiled programs where commands do, for a process that rsjax did not start; environments call it.
+
+    The setting is jax's own, so programs of the rest of the process are kept too. Does nothing if the user chose a
+    directory or none, by ``JAX_COMPILATION_CACHE_DIR`` or in ``jax.config``.
+    """
+    import jax
+    from jax.experimental.compilation_cache import compilation_cache
+
+    chosen = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined] # jax makes it at run time
+    directory = _cache_directory()
+    if CACHE_DIRECTORY in os.environ or chosen is not None or directory is None:
+        return
+    jax.config.update("jax_compilation_cache_dir", str(directory))
+    jax.config.update("jax_compilation_cache_max_size", CACHE_SIZE)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", CACHED_SECONDS)
+    compilation_cache.reset_cache()  # jax looks for its directory at the first program, which may have run
 
 
 def set_xla_flags() -> None:

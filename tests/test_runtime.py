@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from rsjax import runtime
-from rsjax.runtime import HUGE_PAGES, TRITON_PRODUCTS, YNNPACK, set_xla_flags, tune_process
+from rsjax.runtime import CACHE_DIRECTORY, HUGE_PAGES, TRITON_PRODUCTS, YNNPACK, set_xla_flags, tune_process
 
 CUBLAS = f"{TRITON_PRODUCTS}=false"
 
@@ -18,6 +18,17 @@ open(sys.argv[1], "a").write(f"{os.getpid()} ")
 from rsjax.runtime import tune_process
 tune_process()
 print(os.environ.get("GLIBC_TUNABLES"), *sys.argv[2:], sep="\\n")
+"""
+
+# A program that compiles one program before, and one that takes a while after.
+KEEPING = """
+import jax
+from rsjax.runtime import keep_compiled_programs
+jax.jit(lambda x: x + 1)(1.0)
+keep_compiled_programs()
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+def slow(x): return x + 2
+jax.jit(slow)(1.0)
 """
 
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="tuning is only for Linux")
@@ -65,6 +76,19 @@ def test_compiled_programs_are_kept_in_the_users_cache_unless_told_otherwise(
     tune_process()
     chosen = os.environ["JAX_COMPILATION_CACHE_DIR"]
     assert chosen == set_by_user if set_by_user is not None else chosen.startswith(str(tmp_path / "rsjax" / "xla-"))
+
+
+@pytest.mark.parametrize(("set_by_user", "kept"), [(None, True), ("", False)])
+def test_a_process_that_makes_an_environment_keeps_programs_too(
+    tmp_path: Path, set_by_user: str | None, kept: bool
+) -> None:
+    """Also those that are compiled after others."""
+    environment = {name: value for name, value in os.environ.items() if name != CACHE_DIRECTORY}
+    environment |= {"XDG_CACHE_HOME": str(tmp_path)}
+    if set_by_user is not None:
+        environment[CACHE_DIRECTORY] = set_by_user
+    subprocess.run([sys.executable, "-c", KEEPING], cwd=ROOT, env=environment, check=True)
+    assert bool(list(tmp_path.glob("rsjax/xla-*/jit_slow*"))) == kept
 
 
 @pytest.mark.parametrize(

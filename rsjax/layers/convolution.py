@@ -6,6 +6,7 @@ import flax.linen as nn
 import jax
 from jaxtyping import Array, Float
 
+from rsjax.layers.parameters import parameter
 from rsjax.layers.platform import convolve
 
 Dtype = Literal["float32", "bfloat16"]
@@ -27,12 +28,12 @@ class Conv(nn.Module):
     @nn.compact
     def __call__(self, x: Float[Array, "B h w C"]) -> Float[Array, "B h w D"]:
         shape = (self.size, self.size, x.shape[-1], self.features)
-        kernel = self.param("kernel", nn.initializers.lecun_normal(), shape)
+        kernel = parameter(self, "kernel", nn.initializers.lecun_normal(), shape)
         run = convolve if self.bf16 else jax.lax.conv_general_dilated
         strides = (self.stride, self.stride)
         out = run(x, kernel, strides, self.padding, dimension_numbers=("NHWC", "HWIO", "NHWC"))
         if self.use_bias:
-            out = out + self.param("bias", nn.initializers.zeros, (self.features,))
+            out = out + parameter(self, "bias", nn.initializers.zeros, (self.features,))
         return out.astype(x.dtype)
 
 

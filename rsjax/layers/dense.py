@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float
 
-from rsjax.layers.parameters import EPSILON, Norm
+from rsjax.layers.parameters import EPSILON, Norm, parameter
 from rsjax.layers.platform import linear, norm_linear
 
 Params: TypeAlias = dict[str, Any]  # a tree of arrays
@@ -38,8 +38,10 @@ class Dense(nn.Module):
     @nn.compact
     def parameters(self, inputs: int) -> tuple[Float[Array, "K M"], Any]:
         """Returns kernel and bias, which may be None, for a function that does more than this layer."""
-        kernel = self.param("kernel", self.kernel_init, (inputs, self.features))
-        return kernel, self.param("bias", nn.initializers.zeros, (self.features,)) if self.use_bias else None
+        kernel = parameter(self, "kernel", self.kernel_init, (inputs, self.features))
+        if not self.use_bias:
+            return kernel, None
+        return kernel, parameter(self, "bias", nn.initializers.zeros, (self.features,))
 
 
 class NormParameters(nn.Module):
@@ -47,7 +49,8 @@ class NormParameters(nn.Module):
 
     @nn.compact
     def __call__(self, width: int) -> tuple[Float[Array, " C"], Float[Array, " C"]]:
-        return self.param("scale", nn.initializers.ones, (width,)), self.param("bias", nn.initializers.zeros, (width,))
+        scale = parameter(self, "scale", nn.initializers.ones, (width,))
+        return scale, parameter(self, "bias", nn.initializers.zeros, (width,))
 
 
 def dense(

@@ -11,6 +11,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from rsjax.layers.parameters import parameter
+
 
 class GroupNorm(nn.Module):
     """Normalises groups of neighbouring channels to mean 0 and variance 1, then scales and shifts each channel.
@@ -37,8 +39,8 @@ class GroupNorm(nn.Module):
         centred = wide - mean(wide)
         out = centred * jax.lax.rsqrt(mean(jnp.square(centred)) + self.epsilon)
         if self.affine:
-            scale = self.param("scale", nn.initializers.ones, x.shape[-1:])
-            out = out * scale + self.param("bias", nn.initializers.zeros, x.shape[-1:])
+            scale = parameter(self, "scale", nn.initializers.ones, x.shape[-1:])
+            out = out * scale + parameter(self, "bias", nn.initializers.zeros, x.shape[-1:])
         return out.astype(x.dtype)
 
     def _of_cells(self, x: Array) -> Array:

@@ -1,18 +1,20 @@
 """The one door to what differs between platforms: each function is lowered to the implementation for its platform.
 
-The platform is the one that a program is lowered for, so that compiling for a GPU on a machine without one gives the
-GPU's program. Models do not ask for it.
+The platform is the one that a program is lowered for. Models do not ask for it. In a process that has CPUs alone only
+their implementation is traced, unless :func:`for_all_platforms` says that the program is lowered for another platform.
 
 Axes: N rows, frames or sequences, S cells, h heads, e head width; B images, T frames, h×w cells, C and D channels,
 i×j a kernel.
 """
 
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from functools import partial
 from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
+from jax.extend.backend import backends
 from jaxtyping import Array, Float
 
 from rsjax.layers import accelerator, attention
@@ -30,15 +32,34 @@ from rsjax.layers.partition import devices_are_known
 from rsjax.layers.tpu import attention as tpu
 from rsjax.layers.unstacked_params import block_part
 
+_for_all_platforms = jax.make_user_context(default_value=False)  # part of the keys of jax's caches of traced programs
+
+
+def for_all_platforms() -> AbstractContextManager[Any]:
+    """Returns a context in which programs are traced for all platforms, to be lowered for a GPU or TPU without one."""
+    context: AbstractContextManager[Any] = _for_all_platforms(True)
+    return context
+
+
+def platform_dependent(*operands: Any, default: Callable[..., Any], **branches: Callable[..., Any]) -> Any:
+    """Returns what ``jax.lax.platform_dependent`` does, which traces all branches, each time with all that is in it.
+
+    Where branches lie in branches, this takes most of the time before a first step. So a process that can run programs
+    on CPUs alone traces their branch alone.
+    """
+    if set(backends()) == {"cpu"} and not _for_all_platforms.value:
+        return branches.get("cpu", default)(*operands)
+    return jax.lax.platform_dependent(*operands, default=default, **branches)
+
 
 def by_platform(cpu: Callable[..., Any], accelerator: Callable[..., Any], *operands: Any) -> Any:
     """Returns ``cpu(*operands)`` in a program for a CPU and ``accelerator(*operands)`` in one for a GPU or TPU."""
-    return jax.lax.platform_dependent(*operands, cpu=cpu, default=accelerator)
+    return platform_dependent(*operands, cpu=cpu, default=accelerator)
 
 
 def where_launches_take_long(few: Callable[[], Any], other: Callable[[], Any]) -> Any:
     """Returns ``few()`` in a program for an NVIDIA GPU, where small kernels take less than their launches."""
-    return jax.lax.platform_dependent(cuda=few, default=other)
+    return platform_dependent(cuda=few, default=other)
 
 
 def in_feature_dtype(dtype: str, run: Callable[[str], Any]) -> Any:
@@ -115,7 +136,7 @@ def attend_in_clip(
         kernels["cuda"] = partial(gpu.attend, over=over)
     if qkv.dtype == jnp.bfloat16 and tpu.fits(qkv.shape, over) and devices_are_known():
         kernels["tpu"] = partial(tpu.attend, over=over)
-    return jax.lax.platform_dependent(qkv, default=plain, **kernels)
+    return platform_dependent(qkv, default=plain, **kernels)
 
 
 def attend_over_cache(
@@ -133,7 +154,7 @@ def attend_over_cache(
     def kernel(qkv: Array, cache: KeyValues, start: Any) -> Array:
         return gpu_cached.attend(qkv, cache.k, cache.v, start, window)
 
-    return jax.lax.platform_dependent(qkv, cache, start, cuda=kernel, default=plain)
+    return platform_dependent(qkv, cache, start, cuda=kernel, default=plain)
 
 
 def mlp(
@@ -149,7 +170,7 @@ def mlp(
     """
     if x.dtype != jnp.bfloat16 or not gpu_mlp.fits(x.shape, fc1[0].shape[1]):
         return layers(x, norm, fc1, fc2)
-    return jax.lax.platform_dependent(x, norm, fc1, fc2, cuda=gpu_mlp.mlp, default=layers)
+    return platform_dependent(x, norm, fc1, fc2, cuda=gpu_mlp.mlp, default=layers)
 
 
 def feed_forward(
@@ -164,7 +185,7 @@ def feed_forward(
     """
     if x.dtype != jnp.bfloat16 or not gpu_feed_forward.fits(x.shape, fc1[0].shape[1]):
         return layers(x, fc1, fc2)
-    return jax.lax.platform_dependent(x, fc1, fc2, cuda=gpu_feed_forward.feed_forward, default=layers)
+    return platform_dependent(x, fc1, fc2, cuda=gpu_feed_forward.feed_forward, default=layers)
 
 
 def norm_linear(
@@ -182,7 +203,7 @@ def norm_linear(
 
     @jax.custom_vjp
     def run(*operands: Any) -> Any:
-        return jax.lax.platform_dependent(*operands, cuda=gpu_norm_linear.norm_linear, default=layers)
+        return platform_dependent(*operands, cuda=gpu_norm_linear.norm_linear, default=layers)
 
     run.defvjp(lambda *operands: jax.vjp(layers, *operands), lambda pull, cotangent: pull(cotangent))
     out: Array = run(x, norm, kernel)

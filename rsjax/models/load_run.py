@@ -23,8 +23,8 @@ def load(run: Path | str) -> TrainedModel:
     run = locate(checked_path(run, "run"))
     config = load_config(run)
     model = create_model(config)
-    params = load_part(run, "world_model", jax.eval_shape(model.init, jax.random.key(0)))
-    return TrainedModel(config, model, params, load_assets(config, run))
+    params = load_part(run, "world_model", jax.eval_shape(lambda: model.init(jax.random.key(0))))
+    return TrainedModel(config, model, params, load_assets(config, run), run)
 
 
 def load_config(run: Path) -> Config:

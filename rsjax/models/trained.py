@@ -25,12 +25,17 @@ class ShapeError(UserError):
 
 @dataclass(frozen=True)
 class TrainedModel:
-    """A world model with its parameters, ready to generate. Made by :func:`rsjax.load`."""
+    """A world model with its parameters, ready to generate. Made by :func:`rsjax.load`.
+
+    Attributes:
+        directory: the run or saved model that it was loaded from; None: it was made otherwise.
+    """
 
     config: Config
     model: WorldModel[Any]
     params: Params
     assets: Assets
+    directory: Path | None = None
 
     def generate(
         self,

@@ -80,7 +80,7 @@ class Autoencoder(Trainable[B], Protocol[B]):
 
     def shapes(self) -> Params:
         """Returns the shapes of :meth:`tokenizer_params`, without allocating them."""
-        return jax.eval_shape(lambda key: self.tokenizer_params(self.init(key)), jax.random.key(0))
+        return jax.eval_shape(lambda: self.tokenizer_params(self.init(jax.random.key(0))))
 
     def pretrained_shapes(self, directory: Path) -> Params:
         """Returns the shapes of the weights ``directory/tokenizer/weights``, which training may start from.

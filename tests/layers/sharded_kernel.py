@@ -15,7 +15,7 @@ from jaxtyping import Array
 
 from rsjax.layers.gpu.attention import attend
 from rsjax.layers.gpu.mlp import mlp
-from rsjax.layers.platform import attend_in_clip
+from rsjax.layers.platform import attend_in_clip, for_all_platforms
 
 
 def loss(qkv: Array) -> Array:
@@ -30,7 +30,7 @@ def tpu_kernels(mesh: Mesh | None) -> int:
     """Returns the number of kernels in attention lowered for TPUs, traced under this mesh."""
     run = jax.jit(partial(attend_in_clip, over="cells", bf16=True))
     qkv = jax.ShapeDtypeStruct((2, 1, 128, 3, 4, 32), jnp.bfloat16)
-    with nullcontext() if mesh is None else jax.set_mesh(mesh):
+    with for_all_platforms(), nullcontext() if mesh is None else jax.set_mesh(mesh):
         return str(run.trace(qkv).lower(lowering_platforms=("tpu",)).as_text()).count("tpu_custom_call")
 
 

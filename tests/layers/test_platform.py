@@ -31,7 +31,8 @@ DOORS: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {
 
 
 def lowered(run: Callable[..., Any], operands: tuple[Any, ...], target: str) -> str:
-    return jax.jit(run).trace(*operands).lower(lowering_platforms=(target,)).as_text()
+    with platform.for_all_platforms():
+        return jax.jit(run).trace(*operands).lower(lowering_platforms=(target,)).as_text()
 
 
 @pytest.mark.usefixtures("bf16_units")
@@ -40,6 +41,23 @@ def test_a_program_for_a_gpu_or_tpu_is_the_same_wherever_it_is_lowered_and_not_t
     run, operands = DOORS[name]
     programs = {target: lowered(run, operands, target) for target in ("cpu", "cuda", "tpu")}
     assert programs["cuda"] == programs["tpu"] != programs["cpu"]
+
+
+@pytest.mark.usefixtures("bf16_units")
+@pytest.mark.parametrize("name", DOORS)
+def test_a_process_with_cpus_alone_traces_their_branch_alone(name: str) -> None:
+    if {device.platform for device in jax.devices()} != {"cpu"}:
+        pytest.skip("there are other devices")
+    run, operands = DOORS[name]
+    compiled = jax.jit(run)
+    alone = jax.make_jaxpr(run)(*operands)
+    found = compiled(*operands)
+    with platform.for_all_platforms():
+        both = jax.make_jaxpr(run)(*operands)
+        expected = compiled(*operands)
+    assert "platform_index" in str(both)
+    assert "platform_index" not in str(alone)
+    np.testing.assert_array_equal(found, expected)
 
 
 @pytest.mark.usefixtures("bf16_units")

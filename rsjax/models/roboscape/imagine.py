@@ -8,12 +8,12 @@ Axes: B clips, N of them, G clips of a group, S cells, A action dimensions.
 
 from dataclasses import replace
 from functools import partial
-from typing import Any, cast
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Key, UInt8
+from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from rsjax.clip import Video
 from rsjax.config import SampleConfig, TokenizerConfig, TokenModelConfig
@@ -92,20 +92,21 @@ class TokenImagination:
         tokens = {name: grid.reshape(len(first), 1, -1) for name, grid in grids.items()}
         if self._arch.depth != "none":
             tokens.setdefault("depth", np.zeros_like(tokens["rgb"]))
-        keys = jax.vmap(partial(jax.random.fold_in, jax.random.key(self._config.sample.seed)))(jnp.asarray(index))
+        draws = np.asarray(index, np.int32)
         hidden = None
         if self._arch.depth != "none" and not self._has_depth:
-            hidden = jnp.ones(self._size, bool)
+            hidden = np.ones(self._size, bool)
         for number, old in enumerate(self._states):
             lanes = self._lanes(number, count)
             if old is not None and not which[lanes].any():
                 continue
-            cells = {name: jnp.asarray(grid[rows[lanes]]) for name, grid in tokens.items()}
-            fresh = _start(self._arch, self._config.sample, self._params, cells, keys[rows[lanes]], hidden)
+            these = rows[lanes]
+            cells = {name: grid[these] for name, grid in tokens.items()}
+            fresh = _start(self._arch, self._config.sample, self._params, cells, draws[these], hidden)
             if old is None:
                 self._states[number] = fresh
             else:
-                self._states[number] = _restarted(jnp.asarray(which[lanes]), fresh, old)
+                self._states[number] = _restarted(which[lanes], fresh, old)
         self._positions[which] = 1 - int(window_start(self._arch, self._config.sample, 1))
         self._sums[which] = 0
         video = self._codec.decode(grids, np.full(len(first), self._shows_depth))
@@ -129,7 +130,7 @@ class TokenImagination:
             assert state is not None, "restart the clips first"
             lanes = self._lanes(number, count)
             if full[lanes].any():
-                state = _renewed(self._arch, self._config.sample, self._params, state, jnp.asarray(full[lanes]))
+                state = _renewed(self._arch, self._config.sample, self._params, state, full[lanes])
             self._states[number], rgb, depth = _step(
                 self._arch,
                 self._config.sample,
@@ -178,11 +179,12 @@ def _start(
     sample: SampleConfig,
     params: Params,
     tokens: dict[str, Int[Array, "B 1 S"]],
-    keys: Key[Array, " B"],
+    index: Int[Array, " B"],
     no_depth: Bool[Array, " B"] | None,
 ) -> State:
-    """Returns a stack of states, one for each clip, after first frames."""
+    """Returns a stack of states, one for each clip, after first frames; ``index`` decides each clip's draws."""
     actions = jnp.zeros((1, 1, arch.action_inputs))
+    keys = jax.vmap(partial(jax.random.fold_in, jax.random.key(sample.seed)))(index)
 
     def start_clip(tokens: dict[str, Array], key: Array, no_depth: Array | None) -> State:
         cells = {name: x[None] for name, x in tokens.items()}
@@ -219,9 +221,16 @@ def _step(
 
     def pixels(branch: str) -> Array:
         grids = frame[branch].reshape(len(actions), arch.grid, arch.grid, *frame[branch].shape[3:])
-        return cast(Array, run_tokenizer(tokenizer, tokenizer_params, grids, "decode"))
+        return _decoded(tokenizer, tokenizer_params, grids)
 
     rgb = jnp.round(pixels("rgb")).astype(jnp.uint8)
     if normalization is None or normalization.depth_range is None:
         return state, rgb, None
     return state, rgb, color_to_depth(pixels("depth"), *normalization.depth_range, tokenizer.depth_scale)
+
+
+@partial(jax.jit, static_argnums=0)  # so that it is traced once for both branches
+def _decoded(config: TokenizerConfig, params: Params, grids: Array) -> Array:
+    """Returns the pictures of tokens or codes."""
+    pictures: Array = run_tokenizer(config, params, grids, "decode")
+    return pictures

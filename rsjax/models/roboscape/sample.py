@@ -231,7 +231,9 @@ def _decode_frame(
         frame = unmask(keys[:, number], number, frame, {branch: x[:, 0] for branch, x in logits.items()})
         return frame, read_state(arch, params, trunk)
 
-    frame, readings = jax.lax.fori_loop(1, sample.steps, later_pass, (frame, read_state(arch, params, trunk)))
+    readings = read_state(arch, params, trunk)
+    if sample.steps > 1:  # else a loop that never runs would be traced
+        frame, readings = jax.lax.fori_loop(1, sample.steps, later_pass, (frame, readings))
 
     def appended(kept: Array, new: Array) -> Array:
         return jnp.concatenate([kept[:, 1:], new[:, None]], axis=1)

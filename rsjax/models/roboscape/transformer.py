@@ -21,7 +21,7 @@ from rsjax.layers.attention import KeyValues, attend, packed, sees, unpacked
 from rsjax.layers.dense import PRODUCT, Dense, NormParameters, layer_norm
 from rsjax.layers.gelu import gelu
 from rsjax.layers.mlp import feed_forward, mlp
-from rsjax.layers.parameters import Norm
+from rsjax.layers.parameters import Norm, parameter
 from rsjax.layers.partition import gathers
 from rsjax.layers.platform import attend_in_clip, attend_over_cache, in_feature_dtype, known_after, put_frames
 from rsjax.layers.unstacked_params import stack_params
@@ -71,7 +71,9 @@ class TokenEmbed(nn.Module):
             codes = jnp.arange(cfg.vocabulary_size)
             mean = partial(jnp.matmul, precision=jax.lax.Precision.HIGHEST)  # a token's code embeds as the token does
             embedded = sum(mean(shares[..., k, :], table(codes)) for k, table in enumerate(tables))
-        mask_embed = self.param("mask_token_embed", nn.initializers.normal(cfg.departures.embedding_std), (cfg.width,))
+        mask_embed = parameter(
+            self, "mask_token_embed", nn.initializers.normal(cfg.departures.embedding_std), (cfg.width,)
+        )
         return jnp.where(mask[..., None], mask_embed, embedded)
 
 
@@ -344,7 +346,7 @@ class Transformer(nn.Module):
             raise ValueError(f"{frames} frames from {start} on; the model has learned positions for {cfg.frames}")
         learned = 1 if cfg.departures.rotary else cfg.frames
         init = nn.initializers.normal(cfg.departures.embedding_std)
-        position = self.param(f"{prefix}pos_embed", init, (learned, cfg.grid**2, cfg.width))
+        position = parameter(self, f"{prefix}pos_embed", init, (learned, cfg.grid**2, cfg.width))
         if cfg.departures.rotary:
             return position
         return jax.lax.dynamic_slice_in_dim(position, start, frames, axis=0)
@@ -363,7 +365,7 @@ class Transformer(nn.Module):
         else:
             encoded = Dense(cfg.width, name=f"{prefix}action_encoder")(actions)
         if cfg.departures.action_dropout:
-            null = self.param(f"{prefix}null_action", nn.initializers.zeros, (cfg.width,))
+            null = parameter(self, f"{prefix}null_action", nn.initializers.zeros, (cfg.width,))
             encoded = with_null_action(encoded, null, drop)
         return encoded[:, :, None]
 

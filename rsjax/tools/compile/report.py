@@ -17,6 +17,7 @@ from rich.text import Text
 
 from rsjax.errors import UserError, first_line
 from rsjax.files import write_file
+from rsjax.layers.platform import for_all_platforms
 from rsjax.progress import duration
 from rsjax.tools.compile.programs import Program
 from rsjax.tools.compile.roofline import Kernel, Roofline, part_of, roofline
@@ -62,6 +63,7 @@ def compile_program(program: Program, target: Target, console: Console) -> Compi
     with (
         _shown(f"compiling for {target.title}: {program.title}", console),
         answers_for(target.card),
+        for_all_platforms(),
         tempfile.TemporaryDirectory() as folder,
     ):
         options: dict[str, Any] = {}

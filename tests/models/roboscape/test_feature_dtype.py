@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from rsjax.layers.platform import for_all_platforms
 from rsjax.models.roboscape.transformer import Transformer, run_transformer
 from tests.models.roboscape.toy import DUAL, random_inputs, random_params
 
@@ -41,7 +42,8 @@ def test_a_program_for_a_cpu_keeps_features_in_float32() -> None:
 
 
 def test_a_program_for_a_gpu_has_features_in_bf16() -> None:
-    run = jax.jit(partial(run_transformer, WIDE)).trace(random_params(WIDE), *random_inputs(WIDE))
+    with for_all_platforms():
+        run = jax.jit(partial(run_transformer, WIDE)).trace(random_params(WIDE), *random_inputs(WIDE))
     clips, frames = random_inputs(WIDE)[1].shape[:2]
     features = f"tensor<{clips}x{frames}x{WIDE.grid**2}x{WIDE.width}xbf16>"
     assert features in run.lower(lowering_platforms=("cuda",)).as_text()

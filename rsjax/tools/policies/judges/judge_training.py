@@ -72,11 +72,11 @@ def judge_of(run: Path | str | TrainedModel, judge: Judge | Path | str | None, s
     """
     if judge == "run":
         if isinstance(run, TrainedModel):
-            folder = None
+            directory = run.directory
         else:
-            folder = Path(run) / FOLDER
-        if folder is not None and folder.exists():
-            return load_judge(folder, side)
+            directory = Path(run)
+        if directory is not None and (directory / FOLDER).exists():
+            return load_judge(directory / FOLDER, side)
         return None
     if isinstance(judge, Path | str):
         return load_judge(Path(judge), side)

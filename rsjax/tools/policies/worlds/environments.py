@@ -23,6 +23,7 @@ from rsjax.model_directory import locate
 from rsjax.models.base import Imagination
 from rsjax.models.load_run import load, load_config, load_normalization
 from rsjax.models.trained import TrainedModel
+from rsjax.runtime import keep_compiled_programs
 from rsjax.tools.policies.judges.head_judge import NAME as HEAD
 from rsjax.tools.policies.judges.head_judge import HeadJudge, head_judge
 from rsjax.tools.policies.judges.judge import LABELS, Judge
@@ -133,7 +134,7 @@ class _Model:
         if isinstance(run, TrainedModel):
             config = run.config
             normalization = run.assets.normalization
-            folder = Path(".")
+            folder = run.directory or Path(".")
             name = "the model"
         elif isinstance(run, RunData):
             config = run.trained.config
@@ -162,6 +163,7 @@ class _Model:
         self.observation_space = spaces.Dict(observation)
         self._world: ModelWorld | None = None
         if not _forked:  # neither JAX nor TensorStore works in a forked process; the first reset says so
+            keep_compiled_programs()
             if isinstance(run, RunData):
                 trained = run.trained
             elif isinstance(run, TrainedModel):
@@ -234,7 +236,7 @@ class WorldModelEnv(gymnasium.Env[Any, Any]):
     When the judge says "success", the reward is 1 and the episode terminates.
 
     Args:
-        run: a run directory of rsjax train, or a model that ``rsjax.load`` loaded.
+        run: a run directory of rsjax train, a saved model, or a model that ``rsjax.load`` loaded.
         render_mode: "rgb_array", or None.
         imagination: generates the frames; by default the model itself, in this process.
         settings: fields of :class:`EnvironmentSettings`.

@@ -1,5 +1,6 @@
 """The world model as an environment: the frames of ``generate``, Gymnasium's rules, and errors that name shapes."""
 
+import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -11,10 +12,12 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-import rsjax.tools.policies  # noqa: F401 - registers
+import rsjax
+import rsjax.tools.policies  # registers the environments
 from rsjax.config import SampleConfig, StateHeadsConfig
 from rsjax.data.store import Store
 from rsjax.errors import UserError
+from rsjax.model_directory import CLIPS
 from rsjax.models.trained import TrainedModel
 from rsjax.tools.pipeline.run import Run
 from rsjax.tools.policies.judges.judge import HISTORY, LABELS, SUCCESS
@@ -101,6 +104,13 @@ def test_a_given_frame_is_the_clips_own(env: WorldModelEnv, clips: Store) -> Non
     for one, other in zip(held, given, strict=True):
         np.testing.assert_array_equal(one["rgb"], other["rgb"])
         np.testing.assert_array_equal(one["depth"], other["depth"])
+
+
+def test_a_loaded_model_finds_the_clips_beside_it(model: TrainedModel, clips: Store, tmp_path: Path) -> None:
+    model.save(tmp_path / "saved")
+    shutil.copytree(clips.path, tmp_path / "saved" / CLIPS)
+    loaded = rsjax.load(tmp_path / "saved")
+    assert WorldModelEnv(loaded).reset(options={"clip": 1})[1]["clip"] == 1
 
 
 def test_gymnasiums_checker_passes_and_make_finds_the_environment(model: TrainedModel, env: WorldModelEnv) -> None:
