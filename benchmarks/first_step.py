@@ -42,7 +42,7 @@ def first_step(run: str, source: Path, cache: Path) -> dict[str, float]:
     """
     kept = {"JAX_COMPILATION_CACHE_DIR": str(cache), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.1"}
     environment = os.environ | kept | {"PYTHONPATH": str(source.absolute())}
-    line = [sys.executable, "-c", PROGRAM, run]
+    line = [sys.executable, "-P", "-c", PROGRAM, run]
     done = subprocess.run(line, env=environment, stdout=subprocess.PIPE, text=True, check=True)
     return dict(zip(PHASES, json.loads(done.stdout.splitlines()[-1]), strict=True))
 
