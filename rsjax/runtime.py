@@ -49,14 +49,8 @@ def tune_process() -> None:
     starts, hence the restart. Does not restart if the user has set this tunable, or off Linux.
     """
     set_xla_flags()
-    if CACHE_DIRECTORY not in os.environ:
-        # Machines that share a home may have different processors, whose programs must not be mixed: hence one
-        # directory for each set of instructions.
-        name = f"xla-{hashlib.sha256(_processor().encode()).hexdigest()[:8]}"
-        with suppress(RuntimeError):  # the user has no home directory
-            home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-            settings = {CACHE_DIRECTORY: str(home / "rsjax" / name), "JAX_COMPILATION_CACHE_MAX_SIZE": str(CACHE_SIZE)}
-            os.environ |= settings
+    if CACHE_DIRECTORY not in os.environ and (directory := _cache_directory()):
+        os.environ |= {CACHE_DIRECTORY: str(directory), "JAX_COMPILATION_CACHE_MAX_SIZE": str(CACHE_SIZE)}
     tunables = os.environ.get("GLIBC_TUNABLES", "")
     if not sys.platform.startswith("linux") or "glibc.malloc.hugetlb" in tunables:
         return
@@ -83,6 +77,19 @@ def keep_compiled_programs() -> None:
     jax.config.update("jax_compilation_cache_max_size", CACHE_SIZE)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", CACHED_SECONDS)
     compilation_cache.reset_cache()  # jax looks for its directory at the first program, which may have run
+
+
+def _cache_directory() -> Path | None:
+    """Returns the directory of compiled programs; None if the user has no home directory.
+
+    Machines that share a home may have different processors, whose programs must not be mixed: hence one directory for
+    each set of instructions.
+    """
+    try:
+        home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    except RuntimeError:
+        return None
+    return home / "rsjax" / f"xla-{hashlib.sha256(_processor().encode()).hexdigest()[:8]}"
 
 
 def set_xla_flags() -> None:
