@@ -44,7 +44,7 @@ class Cost:
         total = self.tokenizer + self.world_model
         return (
             f"training takes about {duration(self.seconds)} here at most: {total:.2g} operations, and this machine's "
-            f"products reach {self.rate:.2g} a second; an early stop ends it sooner"
+            f"products reach {self.rate:.2g} a second"
         )
 
 
