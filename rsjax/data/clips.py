@@ -54,7 +54,7 @@ class Clips:
         has = np.array([record["depth"] is not None for record in records])
         metres = [record["provenance"].get("depth_unit", "metres") == "metres" for record in records]
         second = None
-        if all("second" in record for record in records):
+        if all(record.get("second") is not None for record in records):
             second = np.stack([record["second"] for record in records])
         return cls(
             second=second,
