@@ -3,7 +3,7 @@
 Axes: T frames, H×W pixels, A action dimensions, N₀ tracks, B clips.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -81,10 +81,9 @@ class Video:
 
     def __getitem__(self, rows: Any) -> "Video":
         """Returns some of the clips: ``rows`` is an array of numbers, a mask or a slice."""
-        parts = (None if x is None else x[rows] for x in (self.depth, self.tasks, self.state, self.second))
-        return Video(self.rgb[rows], *parts)
+        return Video(**{name: x[rows] for name, x in vars(self).items() if x is not None})
 
     def frames(self, first: int, last: int | None = None) -> "Video":
         """Returns frames ``first`` to ``last`` - 1 of every clip."""
-        depth, state, second = (None if x is None else x[:, first:last] for x in (self.depth, self.state, self.second))
-        return Video(self.rgb[:, first:last], depth, self.tasks, state, second)
+        parts = {name: x[:, first:last] for name, x in vars(self).items() if x is not None and name != "tasks"}
+        return replace(self, **parts)

@@ -148,11 +148,12 @@ def _write_merged(stores: Sequence[Store], out: Path, key: str) -> Store:
     meta = {name: value for name, value in first.items() if name not in OF_WHOLE} | _statistics(stores)
     meta |= {"key": key, "merged": [{"path": str(one.path), "key": one.manifest.get("key")} for one in stores]}
     for name in LEFT_OUT:
-        entries = [(store.path, entry) for store in stores for entry in (store.manifest.get(name) or {}).items()]
         reasons: dict[str, str] = {}
-        for path, (episode, why) in entries:
-            reasons[f"{episode} ({path})" if episode in reasons else episode] = why
-        if any(name in store.manifest for store in stores):
+        holders = [store for store in stores if name in store.manifest]
+        for store in holders:
+            for episode, why in (store.manifest[name] or {}).items():
+                reasons[f"{episode} ({store.path})" if episode in reasons else episode] = why
+        if holders:
             meta[name] = reasons
     if all("episodes" in store.manifest for store in stores):
         meta["episodes"] = {}

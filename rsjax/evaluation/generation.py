@@ -77,8 +77,11 @@ class Generation:
         """Generates the batches that do not exist yet; with ``count`` processes, only the share of number ``index``."""
         rows = [(kind, draw) for kind, actions in self.draws.items() for draw in range(len(actions))]
         rows += [(SAMPLE, sample) for sample in range(1, self.protocol.samples)]
-        runs = range(self.protocol.repetitions)
-        batches = [batch for run in runs for kind, draw in rows for batch in self._row(run, kind, draw)][index::count]
+        batches: list[Batch] = []
+        for run in range(self.protocol.repetitions):
+            for kind, draw in rows:
+                batches += self._row(run, kind, draw)
+        batches = batches[index::count]
         with Progress("evaluation", sum(batch.clips for batch in batches), "rollouts") as progress:
             done = 0
             for batch in batches:

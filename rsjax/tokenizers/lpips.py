@@ -82,10 +82,7 @@ def lpips(params: dict[str, Any], one: Float[Array, "*B H W 3"], other: Float[Ar
     taps = _features(params["backbone"], pair.reshape(-1, *one.shape[-3:]))
     distance = jnp.float32(0)
     for k, features in enumerate(taps):
-        square = jnp.sum(jnp.square(features), axis=-1, keepdims=True)
-        # The root's gradient is taken as 0 where all features are 0; the public code gets NaN there.
-        length = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
-        first, second = jnp.split(features / (length + 1e-10), 2)
+        first, second = jnp.split(_unit(features), 2)
         weight = params["head"][str(k)]["weight"][0, :, 0, 0]
         distance += jnp.mean(jnp.square(first - second) @ weight, axis=(1, 2))
     return distance.reshape(batch)
@@ -170,3 +167,11 @@ def _features(backbone: dict[str, Any], images: Float[Array, "B H W 3"]) -> list
         if conv.tap:
             taps.append(x)
     return taps
+
+
+def _unit(features: Float[Array, "B h w C"]) -> Float[Array, "B h w C"]:
+    """Normalises each position's features to length 1."""
+    square = jnp.sum(jnp.square(features), axis=-1, keepdims=True)
+    # The root's gradient is taken as 0 where all features are 0; the public code gets NaN there.
+    length = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
+    return features / (length + 1e-10)

@@ -49,6 +49,7 @@ class TokenizerTraining(Autoencoder[Images]):
     tokenizer: TokenizerConfig
     train: TokenizerTrainConfig
     image_size: int
+    second_view: bool = False
 
     def __post_init__(self) -> None:
         require(
@@ -60,7 +61,7 @@ class TokenizerTraining(Autoencoder[Images]):
     @classmethod
     def create(cls, config: Config) -> "TokenizerTraining":
         """Returns the training of a configuration's tokenizer."""
-        return cls(config.tokenizer, config.tokenizer_train, config.clips.image_size)
+        return cls(config.tokenizer, config.tokenizer_train, config.clips.image_size, config.second_view)
 
     @property
     def loss_weights(self) -> dict[str, float]:
@@ -153,7 +154,8 @@ class TokenizerTraining(Autoencoder[Images]):
 
     def transform(self) -> Transform:
         train = self.train
-        return TokenizerImages(train.frames_per_clip, train.depth_share, self.tokenizer.depth_scale, train.flip)
+        scale = self.tokenizer.depth_scale
+        return TokenizerImages(train.frames_per_clip, train.depth_share, scale, train.flip, self.second_view)
 
     def batch(self, arrays: Arrays) -> UInt8[np.ndarray, "B H W 3"]:
         return image_batch(arrays)
@@ -239,19 +241,19 @@ def read_tokenizer_config(directory: Path) -> TokenizerConfig:
 class TokenizerImages:
     """The loader's transform: draws random frames of a clip, some of them as colourised depth.
 
-    Half of the others are frames of the second view, if the clip has one.
-
     Attributes:
         count: frames per clip.
         depth_share: probability that a frame is replaced by its depth map; 0 for clips without depth.
         scale: of the depth maps' colours.
         flip: whether to mirror each image left to right with probability ½.
+        second_view: whether half of the frames that are not depth maps are of the second view, which clips then have.
     """
 
     count: int
     depth_share: float
     scale: Literal["linear", "inverse"]
     flip: bool
+    second_view: bool = False
 
     def __call__(self, record: Record, rng: np.random.Generator) -> Arrays:
         """Returns ``images``: uint8 (count, H, W, 3)."""
@@ -262,7 +264,7 @@ class TokenizerImages:
             near, far = record["provenance"]["depth_range"]
             colors = depth_to_color(record["depth"][chosen[as_depth]], near, far, self.scale)
             images[as_depth] = colors.astype(np.uint8)
-        if "second" in record:
+        if self.second_view:
             as_second = ~as_depth & (rng.random(self.count) < 0.5)
             images[as_second] = record["second"][chosen[as_second]]
         if self.flip:

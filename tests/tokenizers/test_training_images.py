@@ -52,6 +52,14 @@ def test_a_short_clip_gives_frames_twice(record: Record) -> None:
     assert {place(image, record["rgb"]) for image in images} <= set(range(6))
 
 
+def test_half_of_the_frames_are_of_the_second_view_where_the_model_reads_one(record: Record) -> None:
+    seen = record | {"second": 255 - record["rgb"]}
+    for second_view, low, high in ((False, 0, 0), (True, 70, 130)):
+        transform = TokenizerImages(4, 0.0, "inverse", False, second_view)
+        images = np.concatenate([transform(seen, np.random.default_rng(seed))["images"] for seed in range(50)])
+        assert low <= sum(place(image, seen["second"]) is not None for image in images) <= high
+
+
 def test_the_generator_alone_decides_and_the_record_stays_as_it_is(record: Record) -> None:
     before = {name: np.copy(record[name]) for name in ("rgb", "depth")}
     one, other = (np.stack(list(draws(record, 0.5, seeds=5))) for _ in range(2))

@@ -110,7 +110,12 @@ class Architecture(TransformerConfig):
     @property
     def modalities(self) -> tuple[str, ...]:
         """Names of what the network predicts."""
-        return ("rgb", *["depth"] * (self.depth != "none"), *[SECOND] * self.second_view)
+        names = ["rgb"]
+        if self.depth != "none":
+            names.append("depth")
+        if self.second_view:
+            names.append(SECOND)
+        return tuple(names)
 
     @property
     def inputs(self) -> tuple[str, ...]:
