@@ -234,14 +234,14 @@ def exit_now(status: int) -> NoReturn:
 
     Worker processes end with this one.
     """
-    flush = threading.Thread(target=_flush, daemon=True)
-    flush.start()
-    flush.join(1.0)  # whoever reads the output may have stopped reading
+
+    def flush() -> None:
+        if sys.stdout.isatty():
+            sys.stdout.write("\x1b[?25h")  # a progress bar may have hidden the cursor
+        sys.stdout.flush()
+        sys.stderr.flush()
+
+    thread = threading.Thread(target=flush, daemon=True)
+    thread.start()
+    thread.join(1.0)  # whoever reads the output may have stopped reading
     os._exit(status)
-
-
-def _flush() -> None:
-    if sys.stdout.isatty():
-        sys.stdout.write("\x1b[?25h")  # a progress bar may have hidden the cursor
-    sys.stdout.flush()
-    sys.stderr.flush()

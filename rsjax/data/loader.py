@@ -288,16 +288,16 @@ def batches(
 
 def _start_worker(index: int, count: int) -> None:
     """Prepares a worker process, which leaves signals to its parent and does not outlive the parent."""
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)
-    threading.Thread(target=_die_with_parent, daemon=True).start()
-
-
-def _die_with_parent() -> None:
     parent = multiprocessing.parent_process()
     assert parent is not None
-    parent.join()
-    os._exit(1)
+
+    def die_with_parent() -> None:
+        parent.join()
+        os._exit(1)
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
+    threading.Thread(target=die_with_parent, daemon=True).start()
 
 
 class DeviceBatch(NamedTuple):

@@ -164,22 +164,21 @@ class Checkpoints:
         keep_last, keep_every, keep_best = self._keep
         steps = [path for path in self.directory.iterdir() if path.name.isascii() and path.name.isdigit()]
         self._metrics = {int(path.name): metric for path in steps if (metric := read_metric(path)) is not None}
+
+        def finish() -> None:
+            # Orbax calls this in its thread, when everything is written and only the rename remains.
+            (unfinished,) = self.directory.glob(f"{self._writing}{UNFINISHED}*")
+            write_checksums(unfinished, self._metrics.get(self._writing))
+
         options = ocp.CheckpointManagerOptions(
             preservation_policy=retention(keep_last, keep_every, self._metrics if keep_best else None),
             cleanup_tmp_directories=not self._read_only,
             lightweight_initialize=True,  # otherwise one damaged checkpoint makes all of them unreadable
             # Directories are created before save returns: in the background, orbax's threads signal their creation to
             # each other, and wait for minutes when a signal is lost.
-            async_options=ocp.AsyncOptions(
-                post_finalization_callback=self._finish, create_directories_asynchronously=False
-            ),
+            async_options=ocp.AsyncOptions(post_finalization_callback=finish, create_directories_asynchronously=False),
         )
         return ocp.CheckpointManager(self.directory, options=options)
-
-    def _finish(self) -> None:
-        # Orbax calls this in its thread, when everything is written and only the rename remains.
-        (unfinished,) = self.directory.glob(f"{self._writing}{UNFINISHED}*")
-        write_checksums(unfinished, self._metrics.get(self._writing))
 
     @contextmanager
     def _writes(self) -> Iterator[None]:

@@ -198,7 +198,13 @@ class Sharding:
         """Returns the state as global arrays of all processes, for a checkpoint. The next step donates them."""
         if self.kind == "jit" or jax.process_count() == 1:
             return state
-        return jax.tree.map(self._shared, state)
+
+        def as_global(x: jax.Array) -> jax.Array:
+            if not x.is_fully_addressable:
+                return x
+            return multihost_utils.host_local_array_to_global_array(x, self.mesh, P())
+
+        return jax.tree.map(as_global, state)
 
     def adopt(self, state: TrainState) -> TrainState:
         """Returns a state of numpy arrays or another sharding in this sharding, without a copy if it has this one."""
@@ -219,11 +225,6 @@ class Sharding:
     @property
     def _rows(self) -> NamedSharding:
         return NamedSharding(self.mesh, P((DATA, FSDP)))
-
-    def _shared(self, x: jax.Array) -> jax.Array:
-        if not x.is_fully_addressable:
-            return x
-        return multihost_utils.host_local_array_to_global_array(x, self.mesh, P())
 
     def _shardings(self, tree: PyTree) -> PyTree:
         if self.kind == "mesh":

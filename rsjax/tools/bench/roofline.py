@@ -157,6 +157,12 @@ def _branch_operations(arch: Architecture, modality: str, frames: int, batch: in
     def norm(x: Any, scale: Any, bias: Any) -> Any:
         return layer_norm(None).apply({"params": {"scale": scale, "bias": bias}}, x)
 
+    def over_time(q: Any, k: Any, v: Any) -> Any:
+        return attend(q, k, v, jnp.tril(jnp.ones((frames, frames), bool)))
+
+    def cross_entropy(logits: Any) -> Any:
+        return optax.softmax_cross_entropy_with_integer_labels(logits, jnp.zeros(logits.shape[:-1], jnp.int32))
+
     def attention(name: str, run: Any, groups: int, keys: int) -> Operation:
         shape = (batch, groups, keys, heads, width // heads)
         return Operation(name, blocks, run, (shape,) * 3, 4.0 * rows * keys * width)
@@ -171,14 +177,14 @@ def _branch_operations(arch: Architecture, modality: str, frames: int, batch: in
         product("merge", merges, coarse * width, width),
         product("head", 1, width, codes),
         attention("attention_in_frames", partial(attend_cells, bf16=bf16), frames, cells),
-        attention("attention_over_time", partial(_causal, frames), cells, frames),
+        attention("attention_over_time", over_time, cells, frames),
         Operation("gelu", blocks, gelu, ((rows, hidden),)),
         Operation("norm", norms, norm, ((rows, width), (width,), (width,))),
         Operation("residual_sum", 3 * blocks, jnp.add, ((rows, width),) * 2, passes_on=True),
         Operation(
             "depth_to_rgb_sum", joint, jnp.add, ((batch * frames * arch.grid**2, arch.width),) * 2, passes_on=True
         ),
-        Operation("loss", 1, _cross_entropy, (vocabulary,)),
+        Operation("loss", 1, cross_entropy, (vocabulary,)),
     )
 
 
@@ -248,14 +254,6 @@ def pass_flops(arch: Architecture, cache: StackedCache) -> int:
     """Returns the floating-point operations of a pass over one frame that attends to the cache and to itself."""
     _, clips, _, _, slots, _ = cache["rgb"].k.shape
     return clips * forward_flops(arch, slots + 1) // (slots + 1)
-
-
-def _causal(frames: int, q: Any, k: Any, v: Any) -> Any:
-    return attend(q, k, v, jnp.tril(jnp.ones((frames, frames), bool)))
-
-
-def _cross_entropy(logits: Any) -> Any:
-    return optax.softmax_cross_entropy_with_integer_labels(logits, jnp.zeros(logits.shape[:-1], jnp.int32))
 
 
 def _measure(

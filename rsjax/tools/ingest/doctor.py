@@ -384,30 +384,32 @@ def _check_all(
 
 
 def _open_check(source: EpisodeSource, limits: Thresholds) -> Callable[[tuple[int, EpisodeRef]], Checked]:
-    return lambda numbered: _check(source, limits, numbered[1])
+    """Returns what checks an episode in a worker process."""
 
+    def check(numbered: tuple[int, EpisodeRef]) -> Checked:
+        ref = numbered[1]
+        try:
+            episode = source.read(ref)
+            problems, stats = check_episode(episode, limits)
+            repaired = []  # by the reader
+            for name, value in episode.meta.get("notes", {}).items():
+                parts = value
+                if isinstance(value, dict):
+                    parts = [f"{key} {number}" for key, number in value.items()]
+                if isinstance(parts, list):
+                    parts = ", ".join(map(str, parts))
+                repaired.append(f"{name.replace('_', ' ')}: {parts}")
+            return ref, problems, stats, "; ".join(repaired)
+        except Exception as error:  # an error in one episode must not hide the others
+            line = " ".join(str(error).split())
+            kind = "unreadable"
+            detail = f"{type(error).__name__}: {line}"
+            if isinstance(error, EpisodeError):
+                kind = error.kind
+                detail = line
+            return ref, [Finding(ref.id, kind, detail)], None, ""
 
-def _check(source: EpisodeSource, limits: Thresholds, ref: EpisodeRef) -> Checked:
-    try:
-        episode = source.read(ref)
-        problems, stats = check_episode(episode, limits)
-        repaired = []  # by the reader
-        for name, value in episode.meta.get("notes", {}).items():
-            parts = value
-            if isinstance(value, dict):
-                parts = [f"{key} {number}" for key, number in value.items()]
-            if isinstance(parts, list):
-                parts = ", ".join(map(str, parts))
-            repaired.append(f"{name.replace('_', ' ')}: {parts}")
-        return ref, problems, stats, "; ".join(repaired)
-    except Exception as error:  # an error in one episode must not hide the others
-        line = " ".join(str(error).split())
-        kind = "unreadable"
-        detail = f"{type(error).__name__}: {line}"
-        if isinstance(error, EpisodeError):
-            kind = error.kind
-            detail = line
-        return ref, [Finding(ref.id, kind, detail)], None, ""
+    return check
 
 
 def compare(stats: dict[str, EpisodeStats], unusual: float) -> Iterator[Finding]:

@@ -47,8 +47,12 @@ def parse_json(text: str | bytes) -> Any:
     Raises:
         ValueError: it is not JSON, or is nested too deeply.
     """
+
+    def refuse(constant: str) -> float:
+        raise ValueError(constant)
+
     try:
-        return json.loads(text, parse_constant=_refuse_constant)
+        return json.loads(text, parse_constant=refuse)
     except RecursionError as error:
         raise ValueError("nested too deeply") from error
 
@@ -99,7 +103,3 @@ def _short(value: object) -> str:
     if value is None:
         return "missing"
     return f"{value!r:.40}"
-
-
-def _refuse_constant(name: str) -> float:
-    raise ValueError(name)

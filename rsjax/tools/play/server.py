@@ -41,9 +41,14 @@ MOST_CLIPS = 100  # in one answer
 def make_app(hub: Hub, guard: Guard, sweep: float = SWEEP) -> App:
     """Returns the server's application, which closes the hub and its engine when it ends."""
 
+    async def sweep_hub() -> None:
+        while True:
+            await asyncio.sleep(sweep)
+            hub.sweep()
+
     @asynccontextmanager
     async def lifespan(app: Starlette) -> AsyncIterator[None]:
-        sweeper = asyncio.create_task(_sweep(hub, sweep))
+        sweeper = asyncio.create_task(sweep_hub())
         yield
         sweeper.cancel()
         hub.close()
@@ -67,12 +72,6 @@ def make_app(hub: Hub, guard: Guard, sweep: float = SWEEP) -> App:
 
 async def _missing(request: Request, error: Exception) -> Response:
     return JSONResponse({"error": "missing", "message": "there is nothing at this address"}, 404)
-
-
-async def _sweep(hub: Hub, seconds: float) -> None:
-    while True:
-        await asyncio.sleep(seconds)
-        hub.sweep()
 
 
 class Routes:

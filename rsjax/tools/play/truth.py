@@ -82,7 +82,12 @@ class Follower:
 
     def close(self) -> None:
         """Ends the process."""
-        self._pool.submit(self._end)
+
+        def end() -> None:
+            if self._helper is not None:
+                self._helper.close()
+
+        self._pool.submit(end)
         self._pool.shutdown(wait=False)
         self._truths.give_back()
 
@@ -120,7 +125,3 @@ class Follower:
                 node.truth = Truth(made.rgb, made.depth, made.success, psnr)
                 filled.append(number)
         return filled
-
-    def _end(self) -> None:
-        if self._helper is not None:
-            self._helper.close()

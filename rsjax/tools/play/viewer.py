@@ -57,17 +57,17 @@ def send_uncertainty(session: Session, place: Place, node: Node) -> None:
 
 async def send_depth(session: Session, side: Side, place: Place, node: Node) -> None:
     """Decodes and sends a frame's depth."""
-    message = await side.run(_depth_message, session, place, node)
+    near_far = session.run.trained.assets.normalization.depth_range
+
+    def picture() -> bytes | None:
+        depth = session.engine.branching(session.has_depth).depth(node.state)
+        if depth is None or near_far is None:
+            return None
+        return pictures.depth_picture("depth", place, depth, *near_far)
+
+    message = await side.run(picture)
     if message is not None:
         session.send(message, droppable=True)
-
-
-def _depth_message(session: Session, place: Place, node: Node) -> bytes | None:
-    depth = session.engine.branching(session.has_depth).depth(node.state)
-    near_far = session.run.trained.assets.normalization.depth_range
-    if depth is None or near_far is None:
-        return None
-    return pictures.depth_picture("depth", place, depth, *near_far)
 
 
 def send_truth(session: Session, place: Place, node: Node, kinds: list[str], mean: float | None) -> None:

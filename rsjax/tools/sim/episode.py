@@ -236,7 +236,12 @@ def run_episode(sim: Simulator, config: SimConfig, plan: EpisodePlan) -> Clip:
             bodies = sim.segment()
             pixels = _track_pixels(config, sim, bodies, np.random.default_rng([seed, episode, 1]))
     tracks, visible = track(pixels, views[0].depth, bodies, shots)
-    provenance = _origin(config, seed, episode) | {
+    provenance = {
+        "source": source_name(config),
+        "seed": seed,
+        "episode": episode,
+        "camera": config.camera,
+        "control_hz": ENVIRONMENTS[config.env].control_hz,
         "expert": manner,
         "objects": _in_the_image(shots[0].camera, places, sim.object_width) | {"height": heights, "opening": openings},
         "versions": {name: importlib.metadata.version(name) for name in (ENVIRONMENTS[config.env].package, "mujoco")},
@@ -277,16 +282,6 @@ def clip_seed(provenance: dict[str, Any]) -> int:
 def source_name(config: SimConfig) -> str:
     """Returns the name of the simulator and its robot."""
     return ENVIRONMENTS[config.env].source
-
-
-def _origin(config: SimConfig, seed: int, episode: int) -> dict[str, Any]:
-    return {
-        "source": source_name(config),
-        "seed": seed,
-        "episode": episode,
-        "camera": config.camera,
-        "control_hz": ENVIRONMENTS[config.env].control_hz,
-    }
 
 
 def _replayed(replay: Replay, controls: int, rng: np.random.Generator) -> Callable[[Any], Float[np.ndarray, " C"]]:

@@ -7,7 +7,7 @@ Axes: B videos, F frames of a history, H×W pixels.
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -217,7 +217,15 @@ def train_judge(footage: Footage, held: Footage, steps: int, seed: int = 0) -> T
     params = Network().init(jax.random.key(seed), np.zeros((1, HISTORY, height, height, 3), np.uint8))["params"]
     optimizer = optax.adam(optax.cosine_decay_schedule(2e-3, steps))
     state = optimizer.init(params)
-    step = _make_step(optimizer)
+
+    def loss(params: Any, frames: Array, labels: Array) -> Array:
+        return optax.softmax_cross_entropy_with_integer_labels(_logits(params, frames), labels).mean()
+
+    @jax.jit
+    def step(params: Any, state: Any, frames: Array, labels: Array) -> tuple[Any, Any]:
+        updates, state = optimizer.update(jax.grad(loss)(params, frames, labels), state)
+        return optax.apply_updates(params, updates), state
+
     with Progress("judge", steps, "steps") as progress:
         for number in range(steps):
             params, state = step(params, state, *_batch(footage, found, rng))
@@ -284,18 +292,6 @@ def _temperature(params: Any, held: Footage, rng: np.random.Generator) -> float:
     grid = np.geomspace(0.25, 8, 61)
     log_p = jax.nn.log_softmax(logits[None] / grid[:, None, None], axis=-1)
     return float(grid[np.asarray(log_p)[:, np.arange(len(labels)), labels].mean(1).argmax()])
-
-
-def _make_step(optimizer: optax.GradientTransformation) -> Callable[..., tuple[Any, Any]]:
-    def loss(params: Any, frames: Array, labels: Array) -> Array:
-        return optax.softmax_cross_entropy_with_integer_labels(_logits(params, frames), labels).mean()
-
-    @jax.jit
-    def step(params: Any, state: Any, frames: Array, labels: Array) -> tuple[Any, Any]:
-        updates, state = optimizer.update(jax.grad(loss)(params, frames, labels), state)
-        return optax.apply_updates(params, updates), state
-
-    return step
 
 
 @jax.jit

@@ -193,12 +193,13 @@ class Planner:
             mean = proposals[0]
         if self.plan is not None:
             mean = np.concatenate([self.plan.actions[1:], self.plan.actions[-1:]])
-        limits = (self._low, self._high)
-        self.plan = search(self._held, frames, mean, *limits, self._config, self._rng, proposals)
-        return np.tile(self.plan.actions[0], self._config.hold)
 
-    def _held(self, frames: Any, candidates: Float[np.ndarray, "N H a"]) -> Float[np.ndarray, " N"]:
-        return self._energy(frames, np.tile(candidates, (1, 1, self._config.hold)))
+        def energy(frames: Any, candidates: Float[np.ndarray, "N H a"]) -> Float[np.ndarray, " N"]:
+            return self._energy(frames, np.tile(candidates, (1, 1, self._config.hold)))
+
+        limits = (self._low, self._high)
+        self.plan = search(energy, frames, mean, *limits, self._config, self._rng, proposals)
+        return np.tile(self.plan.actions[0], self._config.hold)
 
 
 def _noise(config: PlannerConfig, width: int, rng: np.random.Generator) -> Float[np.ndarray, "N H A"]:

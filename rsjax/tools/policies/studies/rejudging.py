@@ -108,17 +108,19 @@ def _rollouts(out: Path, results: Mapping[str, Any]) -> dict[str, Rollouts]:
     worlds = ["simulator", *(row["run"] for row in results["runs"])]
     policies = results["runs"][0]["policies"]
     count = int(results["trials"]["episodes"])
-    return {
-        world: {name: [_video(out / world / name / f"episode-{i:02d}.npz") for i in range(count)] for name in policies}
-        for world in worlds
-    }
-
-
-def _video(file: Path) -> UInt8[np.ndarray, "T S S 3"]:
-    if not file.exists():
-        raise UserError(f"{file}: missing; compare the policies again in another --out")
-    with np.load(file) as arrays:
-        return np.asarray(arrays["rgb"])
+    rollouts: dict[str, Rollouts] = {}
+    for world in worlds:
+        videos: Rollouts = {}
+        for name in policies:
+            videos[name] = []
+            for number in range(count):
+                file = out / world / name / f"episode-{number:02d}.npz"
+                if not file.exists():
+                    raise UserError(f"{file}: missing; compare the policies again in another --out")
+                with np.load(file) as arrays:
+                    videos[name].append(np.asarray(arrays["rgb"]))
+        rollouts[world] = videos
+    return rollouts
 
 
 def _verdicts(

@@ -164,7 +164,12 @@ def link_stage(source: Run, run: Run, name: str) -> None:
     ignored = shutil.ignore_patterns("checkpoints", ".*.lock")
 
     def copy(path: str, to: str) -> None:
-        if {output, folder / OWN}.isdisjoint(Path(path).parents) or not _hard_link(path, to):
+        if {output, folder / OWN}.isdisjoint(Path(path).parents):
+            shutil.copy2(path, to)
+            return
+        try:
+            os.link(path, to)
+        except OSError:  # another file system, or one without hard links
             shutil.copy2(path, to)
 
     with disk_guard(temporary):
@@ -174,14 +179,6 @@ def link_stage(source: Run, run: Run, name: str) -> None:
             link(target.absolute() / own.relative_to(folder.resolve()), temporary / output.name)
         shutil.rmtree(target, ignore_errors=True)
         temporary.rename(target)
-
-
-def _hard_link(path: str, to: str) -> bool:
-    try:
-        os.link(path, to)
-    except OSError:
-        return False
-    return True
 
 
 def write_tables(out: Path, data: Path) -> list[Row]:

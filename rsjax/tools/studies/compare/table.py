@@ -210,23 +210,22 @@ def _records(comparison: Comparison) -> list[dict[str, Any]]:
             if each.interval:
                 row |= {"low": each.interval.low, "high": each.interval.high}
             if change:
-                row |= _change(change)
+                row["finding"] = change.finding
+            if change and change.interval:
+                row |= {
+                    "difference": change.interval.value,
+                    "difference_low": change.interval.low,
+                    "difference_high": change.interval.high,
+                }
+            if change and change.welch:
+                row |= {"t": change.welch.t, "df": change.welch.df, "p": change.welch.p}
+                if not math.isfinite(change.welch.t):  # no seed varies; JSON has no infinity
+                    row["t"] = None
             out.append(row)
         for name in comparison.papers:
             if (value := published_score(comparison, metric, name)) is not None:
                 out.append({"metric": metric.name, "entry": name, "kind": "published", "mean": value})
     return out
-
-
-def _change(change: Difference) -> dict[str, Any]:
-    row: dict[str, Any] = {"finding": change.finding}
-    if change.interval:
-        named = {"difference": change.interval.value, "difference_low": change.interval.low}
-        row |= named | {"difference_high": change.interval.high}
-    if change.welch is None:
-        return row
-    t = change.welch.t if math.isfinite(change.welch.t) else None  # infinite if no seed varies; JSON has no infinity
-    return row | {"t": t, "df": change.welch.df, "p": change.welch.p}
 
 
 def as_json(comparison: Comparison) -> dict[str, Any]:

@@ -40,23 +40,20 @@ def run_plan(plan: Plan, out: Path, data: Path, command: str) -> dict[str, State
     states: dict[str, State] = {}
     for number, task in enumerate(plan.tasks, 1):
         place = (number, len(plan.tasks))
+        run = runs[task.cell]
         if task.measurement:
-            _measure(task, runs[task.cell], place)
+            with lock(run.lock_file) as free:
+                if not free or not run.finished("report"):
+                    stage(*place, task.cell, f"{task.measurement}: left out, as its training is not finished")
+                elif measured(run, task.measurement):
+                    stage(*place, task.cell, f"{task.measurement}: up to date, skipped")
+                else:
+                    stage(*place, task.cell, task.measurement)
+                    measure(run, task.measurement)
         else:
             states[task.cell] = run_cell(task.cell, runs, out / "shared", place, command)
         write(plan, out, data, command)
     return states
-
-
-def _measure(task: Task, run: Run, place: tuple[int, int]) -> None:
-    with lock(run.lock_file) as free:
-        if not free or not run.finished("report"):
-            stage(*place, task.cell, f"{task.measurement}: left out, as its training is not finished")
-        elif measured(run, task.measurement):
-            stage(*place, task.cell, f"{task.measurement}: up to date, skipped")
-        else:
-            stage(*place, task.cell, task.measurement)
-            measure(run, task.measurement)
 
 
 def write(plan: Plan, out: Path, data: Path, command: str) -> Path:

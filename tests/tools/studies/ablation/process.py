@@ -34,7 +34,7 @@ def run(place: str, directory: Path) -> None:
     with pytest.MonkeyPatch.context() as patch:
         toy.stub_stages(patch, directory)
         if place == "link":
-            patch.setattr(sweep, "_hard_link", die)
+            patch.setattr(os, "link", die)
         log = toy.log
 
         def slow_or_deadly(record: Path, word: str) -> None:
