@@ -195,6 +195,7 @@ class Transformer(nn.Module):
             in_axes=nn.broadcast,
             length=cfg.blocks,
             unroll=min(cfg.unroll, cfg.blocks),
+            check_constancy_invariants=False,  # else, the blocks are traced twice
         )
         x, _ = scan(arch, name="blocks")(x, time)
         x = _norm("norm_final")(x[:, cfg.text.tokens :])

@@ -168,6 +168,7 @@ class DiT(nn.Module):
             split_rngs={"params": True},
             in_axes=(nn.broadcast, 0),
             unroll=min(cfg.unroll, pairs),
+            check_constancy_invariants=False,  # else, the blocks are traced twice
         )
         x, _ = scan(cfg, name="blocks")(x, (acted, plain), jnp.arange(pairs) == 0)
         ada = nn.Dense(2 * cfg.width, kernel_init=ZEROS, name="final_ada")(nn.silu(last))

@@ -157,6 +157,7 @@ class LLaMA(nn.Module):
             in_axes=(0, nn.broadcast, nn.broadcast),
             length=cfg.blocks,
             unroll=min(cfg.unroll, cfg.blocks),
+            check_constancy_invariants=False,  # else, the blocks are traced twice
         )
         new: Any
         x, new = blocks(cfg, name="blocks")(x, (stack_params(cache), jnp.arange(cfg.blocks)), first, keys)

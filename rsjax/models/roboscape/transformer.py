@@ -320,6 +320,7 @@ class Transformer(nn.Module):
             in_axes=(0, nn.broadcast, nn.broadcast),
             length=cfg.groups,
             unroll=min(cfg.unroll, cfg.groups),
+            check_constancy_invariants=False,  # else, the blocks are traced twice
         )
         new: Any
         x, new = blocks(cfg, name="blocks")(x, stack_params(cache), start, encoded)
