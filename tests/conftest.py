@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from hypothesis import HealthCheck, settings
 
-from rsjax.runtime import set_xla_flags
+from rsjax.runtime import collect_rarely, set_xla_flags
 
 # The tests compile thousands of small programs and run each a few times, so most of their time is compilation. Without
 # LLVM's optimisations, compilation takes half the time; without the fusion emitters, which produce more code, it takes
@@ -27,7 +27,9 @@ for flag, value in FLAGS.items():
     if flag not in os.environ.get("XLA_FLAGS", ""):
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {flag}={value}".strip()
 
-set_xla_flags()  # as every command does
+# As every command does.
+set_xla_flags()
+collect_rarely()
 
 # Programs that one process compiles are loaded by the others (pytest's workers, the commands that tests start). The
 # directory is deleted at the end of the session; to keep one, name it in JAX_COMPILATION_CACHE_DIR. The cache changes
