@@ -182,11 +182,6 @@ class _Placeholder:
     def __setstate__(self, state: object) -> None: ...
 
 
-def _without_default(*_: object) -> dict[Any, Any]:
-    """Stands for collections.defaultdict; drops its factory without calling it."""
-    return {}
-
-
 def _read_torch(path: Path, holders: Sequence[str]) -> tuple[Tensors, dict[str, int], str]:
     try:
         torch: Any = importlib.import_module("torch")
@@ -226,7 +221,11 @@ def _read_torch(path: Path, holders: Sequence[str]) -> tuple[Tensors, dict[str, 
 
 def _unpickled(path: Path, torch: Any) -> Any:
     """Loads a PyTorch file with ``weights_only``: tensors, plain values, and placeholders for other objects."""
-    stand_ins = [(_Placeholder, name) for name in _HARMLESS] + [(_without_default, "collections.defaultdict")]
+
+    def without_default(*_: object) -> dict[Any, Any]:  # stands for defaultdict; drops its factory without a call
+        return {}
+
+    stand_ins = [(_Placeholder, name) for name in _HARMLESS] + [(without_default, "collections.defaultdict")]
     try:
         with torch.serialization.safe_globals(stand_ins):
             return torch.load(path, map_location="cpu", weights_only=True)

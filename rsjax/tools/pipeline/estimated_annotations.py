@@ -13,7 +13,6 @@ A component of ``train.curriculum`` chooses such a copy by its ``annotations``.
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
@@ -72,20 +71,10 @@ def estimated_clips(run: Run, annotations: str) -> Store:
         base = estimated_clips(run, "estimated_depth")
     key = content_key("estimated annotations", RECIPE, str(base.manifest.get("key")), annotations, CLIPS, PASSES)
     out = run.data_directory / f"{run.clips.name}-{annotations}-{key}"
-    with making(out, wait=True):
-        if complete_key(out) != key:
-            _write(out, base, key, annotations)
-    return open_store(out)
-
-
-def _write(out: Path, base: Store, key: str, annotations: str) -> None:
     train = base.source("train")
-    estimate: Callable[[int, Record], Record] = lambda _, clip: followed(clip)  # noqa: E731
-    if annotations == "estimated_depth":
-        estimate = _depth_of_halves(base)
     means = dict(base.manifest.get(ERRORS, {}))
 
-    def estimated() -> Iterator[Record]:
+    def estimated(estimate: Callable[[int, Record], Record]) -> Iterator[Record]:
         rows: dict[str, list[float]] = {}
         with Progress(annotations.replace("_", " "), len(train), "clips") as progress:
             for number, clip in readable(train):
@@ -96,11 +85,18 @@ def _write(out: Path, base: Store, key: str, annotations: str) -> None:
                 yield clip | changed
         means.update({name: float(np.mean(column)) for name, column in rows.items()})
 
-    meta = {name: value for name, value in base.manifest.items() if name not in _OWN_ENTRIES}
-    meta |= {"key": key, "annotations": annotations, ERRORS: means}  # means are known when the manifest is written
-    splits = {name: (clip for _, clip in readable(base.source(name))) for name in base.splits}
-    write_store(out, "clips", {**splits, "train": estimated()}, meta)
-    note(f"{out.name}: {', '.join(f'{name} {value:.3f}' for name, value in means.items())}")
+    with making(out, wait=True):
+        if complete_key(out) == key:
+            return open_store(out)
+        estimate: Callable[[int, Record], Record] = lambda _, clip: followed(clip)  # noqa: E731
+        if annotations == "estimated_depth":
+            estimate = _depth_of_halves(base)
+        meta = {name: value for name, value in base.manifest.items() if name not in _OWN_ENTRIES}
+        meta |= {"key": key, "annotations": annotations, ERRORS: means}  # means are known when the manifest is written
+        splits = {name: (clip for _, clip in readable(base.source(name))) for name in base.splits}
+        write_store(out, "clips", {**splits, "train": estimated(estimate)}, meta)
+        note(f"{out.name}: {', '.join(f'{name} {value:.3f}' for name, value in means.items())}")
+    return open_store(out)
 
 
 def _depth_of_halves(clips: Store) -> Callable[[int, Record], Record]:

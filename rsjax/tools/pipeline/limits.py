@@ -33,8 +33,18 @@ def device_memory() -> int:
 
 def check_batch(config: Config, loop: TrainConfig, stage: Literal["tokenizer", "world_model"]) -> None:
     """Raises :class:`UserError` if a batch's activations cannot fit into the devices' memory."""
+    # At least so many bytes a clip for the backward pass: features of one layer, or inputs of blocks.
+    if stage == "world_model" and isinstance(config.model, TransformerConfig):
+        clip_bytes = 2 * config.model.blocks * config.clips.frames * config.grid**2 * config.model.width
+    elif stage == "world_model":
+        clip_bytes = config.clips.frames * config.clips.image_size**2
+    elif config.autoencoder is config.tokenizer:
+        cells = (config.clips.image_size // config.tokenizer.patch_size) ** 2
+        clip_bytes = 2 * config.tokenizer_train.frames_per_clip * cells * config.tokenizer.channels
+    else:
+        clip_bytes = config.tokenizer_train.frames_per_clip * config.clips.image_size**2
     clips = loop.batch_size / (loop.accumulate * jax.device_count())
-    needed = int(clips * _clip_bytes(config, stage))
+    needed = int(clips * clip_bytes)
     there = device_memory()
     if needed > there:
         section = "tokenizer_train" if stage == "tokenizer" else "train"
@@ -43,18 +53,6 @@ def check_batch(config: Config, loop: TrainConfig, stage: Literal["tokenizer", "
             f"each of {jax.device_count()} devices with {there / GIB:,.0f} GiB; lower it, or raise "
             f"{section}.accumulate (rsjax describe estimates the bytes of a clip)"
         )
-
-
-def _clip_bytes(config: Config, stage: str) -> int:
-    """Returns a lower bound on the bytes per clip for the backward pass: features of one layer, or inputs of blocks."""
-    if stage == "tokenizer" and config.autoencoder is not config.tokenizer:
-        return config.tokenizer_train.frames_per_clip * config.clips.image_size**2
-    if stage == "tokenizer":
-        cells = (config.clips.image_size // config.tokenizer.patch_size) ** 2
-        return 2 * config.tokenizer_train.frames_per_clip * cells * config.tokenizer.channels
-    if not isinstance(config.model, TransformerConfig):
-        return config.clips.frames * config.clips.image_size**2
-    return 2 * config.model.blocks * config.clips.frames * config.grid**2 * config.model.width
 
 
 def check_rollout(config: Config, frames: int) -> None:

@@ -116,7 +116,15 @@ class Engine:
         self._thread.join()
 
     def _run(self) -> None:
-        while works := self._next():
+        while True:
+            with self._wake:
+                self._wake.wait_for(lambda: self._waiting or self._closed)
+                if self._closed:
+                    return
+                key = self._waiting[0].key
+                works = [work for work in self._waiting if work.key == key][: self.lanes]
+                for work in works:
+                    self._waiting.remove(work)
             works = [work for work in works if work.done.set_running_or_notify_cancel()]
             if not works:
                 continue
@@ -129,18 +137,6 @@ class Engine:
             self.frames += len(works)
             for work, state in zip(works, states, strict=True):
                 work.done.set_result(state)
-
-    def _next(self) -> list[Work]:
-        """Waits for work and returns the work of the next pass; an empty list once the engine is closed."""
-        with self._wake:
-            self._wake.wait_for(lambda: self._waiting or self._closed)
-            if self._closed:
-                return []
-            key = self._waiting[0].key
-            works = [work for work in self._waiting if work.key == key][: self.lanes]
-            for work in works:
-                self._waiting.remove(work)
-            return works
 
     def _advance(self, works: list[Work]) -> list[BranchState]:
         key = works[0].key

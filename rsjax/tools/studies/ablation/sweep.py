@@ -127,26 +127,29 @@ def share(run: Run, others: Sequence[Run], shared: Path) -> None:
     cells = [path for path in sorted(run.directory.parent.iterdir()) if path.is_dir() and path != run.directory]
     beside = [replace(run, directory=path) for path in cells]
     for name in (name for name in SHARED if name in run.stages and not run.finished(name)):
-        key = run.keys()[name]
-        if source := next((source for source in beside if source.finished(name)), None):
+        source = next((source for source in beside if source.finished(name)), None)
+        if source is not None:
             link_stage(source, run, name)
-        elif name != "world_model" or any(other.keys().get(name) == key for other in others):
-            maker = Run(run.config, shared / f"{name}-{key}", run.data_directory)
-            with lock(maker.lock_file, wait=f"waiting for another process that makes the {name}"):
-                if not maker.finished(name):
-                    _make(maker, run, name)
-                link_stage(maker, run, name)
-
-
-def _make(maker: Run, run: Run, name: str) -> None:
-    """Makes a stage in a shared run directory; the stages before it are taken from the cell's run."""
-    maker.prepare(overwrite=False)
-    for before in (before for before in SHARED[: SHARED.index(name)] if before in run.stages):
-        link_stage(run, maker, before)
-    note(f"for all cells that share it, in {maker.directory}: {name.replace('_', ' ')}")
-    train = {"tokenizer": stages.train_tokenizer, "world_model": stages.train_world_model}
-    with maker.stage(name):
-        train[name](maker, resume=True) if name in train else stages.prepare(maker)
+            continue
+        key = run.keys()[name]
+        if name == "world_model" and all(other.keys().get(name) != key for other in others):
+            continue
+        maker = Run(run.config, shared / f"{name}-{key}", run.data_directory)
+        with lock(maker.lock_file, wait=f"waiting for another process that makes the {name}"):
+            if not maker.finished(name):
+                maker.prepare(overwrite=False)
+                for before in SHARED[: SHARED.index(name)]:
+                    if before in run.stages:
+                        link_stage(run, maker, before)
+                note(f"for all cells that share it, in {maker.directory}: {name.replace('_', ' ')}")
+                with maker.stage(name):
+                    if name == "tokenizer":
+                        stages.train_tokenizer(maker, resume=True)
+                    elif name == "world_model":
+                        stages.train_world_model(maker, resume=True)
+                    else:
+                        stages.prepare(maker)
+            link_stage(maker, run, name)
 
 
 def link_stage(source: Run, run: Run, name: str) -> None:
