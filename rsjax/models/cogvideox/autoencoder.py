@@ -15,7 +15,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Key, UInt8
+from jaxtyping import Array, Bool, Key, UInt8
 
 from rsjax.clip import Video
 from rsjax.config import Config, require
@@ -29,7 +29,6 @@ from rsjax.models.diffusion import latents as distributions
 from rsjax.models.saved import check_alike, read_model
 from rsjax.tokenizers.codec import images_per_pass, in_chunks
 from rsjax.tokenizers.flops import traced_flops
-from rsjax.tokenizers.magvit2 import to_frames, to_unit
 from rsjax.tokenizers.training import require_no_adversarial
 from rsjax.trainable import Params
 
@@ -152,7 +151,7 @@ class CausalCodec:
         """Decodes "mean", the latents of an odd number of latent frames, and keeps "frames" frames if that is given."""
         latents = np.asarray(tokens["mean"])
         most = images_per_pass(latents.shape[-2] * self.config.downsampling) // (COMPRESSION * latents.shape[1])
-        frames = in_chunks(partial(self._run, _decode), latents, 4, max(1, most))
+        frames = in_chunks(partial(self._run, distributions.decode_pixels, vae.decode), latents, 4, max(1, most))
         if "frames" in tokens:
             frames = frames[:, : tokens["frames"][0]]
         return Video(frames)
@@ -177,18 +176,8 @@ class CausalCodec:
 
     def _encode(self, frames: np.ndarray) -> dict[str, np.ndarray]:
         most = images_per_pass(frames.shape[2]) // frames.shape[1]
-        made = in_chunks(partial(self._run, _encode), frames, 4, max(1, most))
+        made = in_chunks(partial(self._run, distributions.encode_pixels, vae.encode), frames, 4, max(1, most))
         return dict(zip(("mean", "deviation"), np.split(made, 2, axis=-1), strict=True))
 
-    def _run(self, function: Any, chunk: np.ndarray) -> Any:
-        return function(self.config, self.params, divide(chunk, self.params))
-
-
-@partial(jax.jit, static_argnums=0)
-def _encode(config: CausalVAEConfig, params: Params, frames: Any) -> Float[Array, "B t h w z2"]:
-    return distributions.standardised(vae.encode(config, params, to_unit(frames)), params["latents"])
-
-
-@partial(jax.jit, static_argnums=0)
-def _decode(config: CausalVAEConfig, params: Params, latents: Any) -> UInt8[Array, "B T H W 3"]:
-    return to_frames(vae.decode(config, params, distributions.original(latents, params["latents"])))
+    def _run(self, function: Any, network: distributions.Network, chunk: np.ndarray) -> Any:
+        return function(network, self.config, self.params, divide(chunk, self.params))

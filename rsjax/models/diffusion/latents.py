@@ -3,23 +3,26 @@
 Axes: B rows of a batch, z latent channels.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, Key
+from jaxtyping import Array, Float, Int, Key, UInt8
 
 from rsjax.config import TokenizerTrainConfig
 from rsjax.tokenizers.autoencoder import Autoencoder
 from rsjax.tokenizers.lpips import lpips
-from rsjax.tokenizers.magvit2 import to_unit
+from rsjax.tokenizers.magvit2 import to_frames, to_unit
 from rsjax.tokenizers.training import lpips_weights
 from rsjax.trainable import Extra, Params, Scalar, StepContext, Term
 
 LOG_VARIANCE = (-30.0, 20.0)  # limits of the posterior's log-variance, as in the public code
 Pixels = Float[Array, "*N 3"]
 Latents = Float[Array, "*M z"]
+Network = Callable[[Any, Params, Any], Array]  # an encoder or a decoder, of its settings, parameters and input
 Batch = dict[
     str, Any
 ]  # "frames", images or videos of 0–255 (B, …, H, W, 3), and "index" (B,), which determines the noise
@@ -117,3 +120,15 @@ def standardised(made: Float[Array, "*M z2"], fitted: Params) -> Float[Array, "*
 def original(latents: Any, fitted: Params) -> Latents:
     """Returns latents in the decoder's scale: the inverse of :func:`standardised`."""
     return latents * jnp.exp(fitted["log_deviation"]) + fitted["mean"]
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def encode_pixels(encode: Network, config: Any, params: Params, pixels: Any) -> Float[Array, "*M z2"]:
+    """Returns the standardised mean and deviation of the posterior of frames of 0–255."""
+    return standardised(encode(config, params, to_unit(pixels)), params["latents"])
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def decode_pixels(decode: Network, config: Any, params: Params, latents: Any) -> UInt8[Array, "*N 3"]:
+    """Decodes standardised latents to frames."""
+    return to_frames(decode(config, params, original(latents, params["latents"])))

@@ -33,7 +33,6 @@ from rsjax.models.irasim.config import KLConfig
 from rsjax.tokenizers import magvit2, vae_blocks
 from rsjax.tokenizers.codec import images_per_pass, in_chunks
 from rsjax.tokenizers.flops import traced_flops
-from rsjax.tokenizers.magvit2 import to_frames, to_unit
 from rsjax.tokenizers.training import TokenizerImages, image_batch, require_no_adversarial
 from rsjax.tokenizers.vae_blocks import Map
 from rsjax.trainable import Params
@@ -91,9 +90,14 @@ def init(config: KLConfig, key: Key[Array, ""]) -> Params:
     }
 
 
+def encode(config: KLConfig, params: Params, images: Images) -> Float[Array, "B h w z2"]:
+    """Returns the encoder's output, the mean and the log-variance of images' latents side by side."""
+    return networks(config)[0].apply({"params": params["encoder"]}, images)
+
+
 def posterior(config: KLConfig, params: Params, images: Images) -> tuple[Latents, Latents]:
     """Returns the mean and the log-variance of images' latents, which are not standardised."""
-    return distributions.posterior(networks(config)[0].apply({"params": params["encoder"]}, images))
+    return distributions.posterior(encode(config, params, images))
 
 
 def decode(config: KLConfig, params: Params, latents: Latents) -> Images:
@@ -140,10 +144,10 @@ class KLTraining(distributions.PosteriorTraining):
     def flops(self) -> dict[str, int]:
         config = replace(self.config, compute_dtype="float32")  # products of bf16 operands multiply padding too
 
-        def encode(params: Params, images: Images) -> Latents:
+        def mean(params: Params, images: Images) -> Latents:
             return posterior(config, params, images)[0]
 
-        return traced_flops(self.shapes(), (1, self.image_size, self.image_size, 3), encode, partial(decode, config))
+        return traced_flops(self.shapes(), (1, self.image_size, self.image_size, 3), mean, partial(decode, config))
 
     def pretrained_shapes(self, directory: Path) -> Params:
         saved = pretrained.check_autoencoder(directory, self.config)
@@ -204,24 +208,14 @@ class KLCodec:
         return depth_to_color(depth, *near_far, self.config.depth).astype(np.uint8)
 
     def _posterior(self, images: UInt8[np.ndarray, "B T H W 3"]) -> dict[str, Float[np.ndarray, "B T h w z"]]:
-        made = in_chunks(partial(self._run, _encode), images, 3, images_per_pass(images.shape[-2]))
+        run = partial(self._run, distributions.encode_pixels, encode)
+        made = in_chunks(run, images, 3, images_per_pass(images.shape[-2]))
         mean, deviation = np.split(made, 2, axis=-1)
         return {"mean": mean, "deviation": deviation}
 
     def _images(self, latents: Float[np.ndarray, "B T h w z"]) -> UInt8[np.ndarray, "B T H W 3"]:
         side = latents.shape[-2] * self.config.downsampling
-        return in_chunks(partial(self._run, _decode), latents, 3, images_per_pass(side))
+        return in_chunks(partial(self._run, distributions.decode_pixels, decode), latents, 3, images_per_pass(side))
 
-    def _run(self, function: Any, chunk: np.ndarray) -> Any:
-        return function(self.config, self.params, divide(chunk, self.params))
-
-
-@partial(jax.jit, static_argnums=0)
-def _encode(config: KLConfig, params: Params, images: Any) -> Float[Array, "B h w z2"]:
-    made = networks(config)[0].apply({"params": params["encoder"]}, to_unit(images))
-    return distributions.standardised(made, params["latents"])
-
-
-@partial(jax.jit, static_argnums=0)
-def _decode(config: KLConfig, params: Params, latents: Any) -> UInt8[Array, "B H W 3"]:
-    return to_frames(decode(config, params, distributions.original(latents, params["latents"])))
+    def _run(self, function: Any, network: distributions.Network, chunk: np.ndarray) -> Any:
+        return function(network, self.config, self.params, divide(chunk, self.params))
