@@ -55,6 +55,9 @@ class Options:
     """The source's own settings, such as kind=delta (docs/formats.md)."""
     depth: str = "recorded"
     """recorded, none, or a network that estimates depth, such as depth-anything:… (docs/annotate.md)."""
+    delay: int = -1
+    """Recorded frames by which commands act later than the data set says; -1: measured on training episodes, by how
+    much of the motion in the picture they explain."""
     test_share: float = 0.2
     """Share of the episodes that scores are of; no training sees them."""
     validation_share: float = 0.1

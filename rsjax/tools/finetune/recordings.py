@@ -1,5 +1,6 @@
 """The clips of a fine-tuning: a store as it is, or recordings that are ingested with defaults that fit them."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -8,15 +9,19 @@ import numpy as np
 from rsjax.config import require
 from rsjax.data.store import MANIFEST
 from rsjax.errors import UserError
+from rsjax.progress import note
+from rsjax.tools.finetune.delay import measure_delay
 from rsjax.tools.ingest.actions import ActionConfig, Compose, Layout, check_declared
-from rsjax.tools.ingest.episode import Episode, EpisodeError
+from rsjax.tools.ingest.episode import Episode, EpisodeError, EpisodeRef, EpisodeSource
 from rsjax.tools.ingest.formats import FORMATS, open_source
 from rsjax.tools.ingest.options import IngestOptions, source_options
+from rsjax.tools.ingest.packing import split_episodes
 from rsjax.tools.ingest.windows import WindowConfig
+from rsjax.tools.ingest.work_items import SplitShares
 
 RATE = 5.0  # frames per second that clips have at most: those of tiny, and of most data sets of robots
 LEAST_FRAMES = 4
-LOOKED_AT = 20  # episodes whose length and rate decide; their tables are read, not their pictures
+LOOKED_AT = 20  # episodes whose length and rate decide; as many of the training split for the delay of commands
 LENGTH_SHARE = 0.8  # of a short episode's frames, so that it gives more than one clip
 MOST_CLIPS = 4000  # about; with more, clips overlap less
 
@@ -42,6 +47,8 @@ class Cutting:
         frames, rate: of a clip; 0: chosen by the recordings.
         camera, option: as of ``rsjax ingest``.
         depth: likewise.
+        delay: recorded frames by which commands act later than the format says; -1: measured on training episodes
+            (:mod:`rsjax.tools.finetune.delay`), or 0 if nobody says whether actions add up.
         test_share, validation_share: shares of the episodes.
         split_seed: chooses which episodes they are.
         workers: processes; -1: one per core.
@@ -52,10 +59,14 @@ class Cutting:
     camera: str = ""
     option: tuple[str, ...] = ()
     depth: str = "recorded"
+    delay: int = -1
     test_share: float = 0.2
     validation_share: float = 0.1
     split_seed: int = 0
     workers: int = -1
+
+    def __post_init__(self) -> None:
+        require(self.delay >= -1, f"--delay is {self.delay}; give a number of recorded frames, or -1 to measure it")
 
 
 def find_recordings(word: str, cutting: Cutting) -> Recordings:
@@ -87,7 +98,7 @@ def ingest_options(
 
     Clips have every n-th frame, so that the rate is 5 Hz or a little more or less, and as many frames as the model has
     positions, or fewer if episodes are short. Where a data set does not say whether actions add up, a clip's action is
-    the recorded ones of its interval, one after another.
+    the recorded ones of its interval, one after another; otherwise they are moved to the motion that they cause.
 
     Args:
         image_size: pixels a side.
@@ -98,13 +109,7 @@ def ingest_options(
     """
     source = open_source(recordings.source, recordings.path.absolute(), **source_options(cutting.option))
     refs = list(source.episodes())
-    episodes = []
-    reason = "there is none"
-    for ref in refs[:LOOKED_AT]:
-        try:
-            episodes.append(source.read(ref))
-        except EpisodeError as error:
-            reason = str(error)
+    episodes, reason = readable_episodes(source, refs[:LOOKED_AT])
     require(bool(episodes), f"{recordings.path}: no episode can be read ({reason})")
     fps = float(np.median([episode.fps for episode in episodes]))
     every = max(1, round(fps / (cutting.rate or RATE)))
@@ -117,11 +122,19 @@ def ingest_options(
         f"to {most_frames}: set --rate or --frames (a quarter of the episodes has {short} frames or fewer)",
     )
     total = len(refs) * float(np.mean(lengths))
+    compose = how_to_compose(episodes[0], every)
+    delay = max(0, cutting.delay)
+    if cutting.delay == -1 and says_what_actions_are(episodes[0]):
+        shares = SplitShares(cutting.test_share, cutting.validation_share, cutting.split_seed)
+        training = split_episodes(refs, shares)["train"]
+        measured = measure_delay(readable_episodes(source, training[:LOOKED_AT])[0], cutting.camera, every)
+        note(str(measured))
+        delay = measured.frames
     return IngestOptions(
         out=out,
         option=cutting.option,
         windows=WindowConfig(frames=frames, rate=fps / every, hop=max(1, round(total / MOST_CLIPS))),
-        actions=ActionConfig(compose=how_to_compose(episodes[0], every)),
+        actions=ActionConfig(offset=delay, compose=compose),
         image_size=image_size,
         camera=cutting.camera,
         depth=cutting.depth,
@@ -130,6 +143,27 @@ def ingest_options(
         split_seed=cutting.split_seed,
         workers=cutting.workers,
     )
+
+
+def readable_episodes(source: EpisodeSource, refs: Sequence[EpisodeRef]) -> tuple[list[Episode], str]:
+    """Returns the episodes that can be read, and why the last of the others cannot."""
+    episodes = []
+    reason = "there is none"
+    for ref in refs:
+        try:
+            episodes.append(source.read(ref))
+        except EpisodeError as error:
+            reason = str(error)
+    return episodes, reason
+
+
+def says_what_actions_are(episode: Episode) -> bool:
+    """Returns whether an episode's data set declares what may be done to its actions besides copying them."""
+    try:
+        check_declared(Layout.from_json(episode.meta.get("actions", {})), 1, ActionConfig(offset=1))
+    except EpisodeError:
+        return False
+    return True
 
 
 def how_to_compose(episode: Episode, every: int) -> Compose:
