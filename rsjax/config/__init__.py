@@ -23,6 +23,7 @@ from rsjax.config.model import ModelConfig, families, register_family
 from rsjax.config.run import SIMULATOR, WEIGHTS, Config, EvalConfig
 from rsjax.config.sim import SimConfig
 from rsjax.config.token_model import (
+    BackwardsConfig,
     CorruptionConfig,
     Departures,
     DepthBranch,
@@ -57,6 +58,7 @@ __all__ = [
     "WEIGHTS",
     "AdamW",
     "AdversarialConfig",
+    "BackwardsConfig",
     "ClipShape",
     "ComponentConfig",
     "Config",

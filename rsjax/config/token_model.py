@@ -24,6 +24,21 @@ class CorruptionConfig:
 
 
 @dataclass(frozen=True)
+class BackwardsConfig:
+    """Lets training clips run backwards, with the actions that lead back.
+
+    :mod:`rsjax.models.roboscape.departures.backwards` says how.
+    """
+
+    share: float = 0.5  # of the clips that are drawn
+    # Dimensions of an action that are states, such as a gripper's opening; the others are steps, whose sign changes.
+    held: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        require_range(self, "model.backwards", 0, 1, "share")
+
+
+@dataclass(frozen=True)
 class PublicCodeConfig:
     """Options of the public Genie that published weights may use; ``rsjax convert`` sets them."""
 
@@ -291,6 +306,7 @@ class TokenModelConfig(TransformerConfig, ModelConfig):
     max_frames: int = 0
     corruption: CorruptionConfig | None = CorruptionConfig()  # off: models of few steps lose more than they gain
     state_heads: StateHeadsConfig | None = None  # on where a model is to judge success itself
+    backwards: BackwardsConfig | None = later(None)  # on for few clips, in which a scene seldom moves both ways
     sample: SampleConfig = sampling(SampleConfig())  # how frames are generated; may change after training
 
     @property

@@ -150,7 +150,12 @@ class RoboScape(WorldModel[Batch]):
         integrate = self.config.departures.integrate_actions
         arch = self.architecture
         return partial(
-            records.token_arrays, normalization, integrate, state=arch.state_heads, second_view=arch.second_view
+            records.token_arrays,
+            normalization,
+            integrate,
+            state=arch.state_heads,
+            second_view=arch.second_view,
+            backwards=self.config.backwards,
         )
 
     def batch(self, arrays: Arrays) -> Batch:

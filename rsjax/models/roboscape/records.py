@@ -2,11 +2,12 @@
 
 import numpy as np
 
-from rsjax.config import ClipShape
+from rsjax.config import BackwardsConfig, ClipShape
 from rsjax.data.codec import Record
 from rsjax.data.loader import Arrays
 from rsjax.data.normalization import Normalization
 from rsjax.data.state_labels import state_labels
+from rsjax.models.roboscape.departures.backwards import drawn_direction
 from rsjax.models.roboscape.departures.second_view import SECOND
 from rsjax.models.roboscape.departures.shifts import drawn_copy
 from rsjax.models.roboscape.objective import Batch
@@ -21,17 +22,19 @@ def token_arrays(
     rng: np.random.Generator,
     state: bool = False,
     second_view: bool = False,
+    backwards: BackwardsConfig | None = None,
 ) -> Arrays:
     """Returns the arrays of a token record that a training step reads.
 
     Args:
         normalization: that of the run's own store, even for records of other stores.
         integrate: whether to append the actions' sums (see ``Normalization.action_inputs``).
-        rng: chooses among the clip and its moved copies, if it has any.
+        rng: chooses among the clip and its moved copies, if it has any, and the direction.
         state: whether to add the labels of the state heads.
         second_view: whether to add the tokens of the second view.
+        backwards: which clips run backwards.
     """
-    record = drawn_copy(record, rng)
+    record = drawn_direction(backwards, drawn_copy(record, rng), rng)
     has_depth = record["depth"] is not None
     depth = record["depth"] if has_depth else np.zeros_like(record["rgb"])
     arrays = {

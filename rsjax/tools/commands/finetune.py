@@ -38,13 +38,17 @@ class Options:
     """Likewise, of the tokenizer."""
     short_share: float = 0.0
     """Share of the world model's steps that train on the first half of each clip, which costs half."""
-    patience: int = 8
-    """Validations in a row without a better one that end a training; a whole training has 8, so 3 ends many early."""
+    patience: int = -1
+    """Validations in a row without a better one that end a training; a whole training has 8, so 3 ends many early, and
+    the best weights count. 0: the world model's last weights count; -1: 8, or 0 with fewer than 30 held-out clips."""
     seed: int = 0
     """Seed of both trainings."""
     keep_still: Literal["measure", "on", "off"] = "measure"
     """Keep from a clip's first frame what does not change, which the tokenizer would blur; measure: if less than half
     of the pixels move in held-out clips. It changes videos, not the training's losses."""
+    backwards: Literal["measure", "on", "off"] = "measure"
+    """Let half of the training clips run backwards, with the actions that lead back; measure: if there are fewer than
+    300, and the data set says what its actions are."""
     frames: int = 0
     """Frames of a clip; 0: as many as the model takes, or fewer if episodes are short."""
     rate: float = 0.0

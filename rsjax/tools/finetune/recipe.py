@@ -7,6 +7,7 @@ import numpy as np
 
 from rsjax.clip import Video
 from rsjax.config import (
+    BackwardsConfig,
     Config,
     CurriculumStageConfig,
     EarlyStopConfig,
@@ -37,6 +38,8 @@ TOKENIZER_EPOCHS = 27
 LEAST_STEPS = 100
 MOST_STEPS = 1500
 MOST_TOKENIZER_STEPS = 600
+FEW_HELD_OUT = 30  # clips; fewer choose among weights by chance
+FEW_CLIPS = 300  # of the training split; with fewer, clips also run backwards
 COPIES = 12  # moved copies of each clip, at least, where the model was trained with some: few clips last longer
 
 
@@ -51,10 +54,14 @@ class Finetuning:
         tokenizer: measure: keep it if it reconstructs the new frames well (:func:`keeps_tokenizer`); or keep or adapt.
         learning_rate, tokenizer_learning_rate: peaks, as shares of those that the model was trained with.
         short_share: share of the world model's steps on the first half of each clip.
-        patience: validations without a new best one that end a training; there are eight in a whole training.
+        patience: validations without a new best one that end a training; there are eight in a whole training, so that 8
+            ends none early, and the weights are those of the best validation. 0: the world model's last weights count.
+            -1: 8, or 0 with few held-out clips (:data:`FEW_HELD_OUT`).
         seed: of both trainings.
         keep_still: whether videos keep what stands still (:class:`rsjax.config.KeepStillConfig`); measure: if the
             camera stands still (:data:`FIXED_CAMERA`).
+        backwards: whether half of the drawn clips run backwards (:class:`rsjax.config.BackwardsConfig`); measure: if
+            there are few (:data:`FEW_CLIPS`) and the data set says what their actions are.
     """
 
     steps: int = -1
@@ -63,9 +70,10 @@ class Finetuning:
     learning_rate: float = 0.5
     tokenizer_learning_rate: float = 1.0
     short_share: float = 0.0
-    patience: int = 8
+    patience: int = -1
     seed: int = 0
     keep_still: Literal["measure", "on", "off"] = later("measure")
+    backwards: Literal["measure", "on", "off"] = later("measure")
 
     def __post_init__(self) -> None:
         require(self.steps >= -1, f"--steps is {self.steps}; give a number, or -1 for as many as suit the clips")
@@ -73,6 +81,7 @@ class Finetuning:
             self.tokenizer_steps == -1 or self.tokenizer_steps >= 1,
             f"--tokenizer-steps is {self.tokenizer_steps}; give a number above 0, or -1 for as many as suit the clips",
         )
+        require(self.patience >= -1, f"--patience is {self.patience}; give a number of validations, 0, or -1")
         for name in ("learning_rate", "tokenizer_learning_rate"):
             value = getattr(self, name)
             require(value > 0, f"--{name.replace('_', '-')} is {value}; it is a share of the model's own, above 0")
@@ -136,6 +145,20 @@ def moving_share(store: Store) -> float:
     return float(np.mean([moved(rgb)[-1] for rgb in clips.rgb]))
 
 
+def reversible(store: Store) -> BackwardsConfig | None:
+    """Returns how the store's clips run backwards; None if one of their actions is neither a step nor a state."""
+    held = []
+    dimensions = store.manifest.get("action_dimensions") or []
+    for number, line in enumerate(dimensions):
+        if line.endswith("(held)"):
+            held.append(number)
+        elif not line.endswith("(delta)"):
+            return None
+    if not dimensions:
+        return None
+    return BackwardsConfig(held=tuple(held))
+
+
 def finetuned(
     source: Source, store: Store, start: str, settings: Finetuning, adapts: bool, still: bool = False
 ) -> Config:
@@ -159,15 +182,25 @@ def finetuned(
     kept = None
     if still:
         kept = KeepStillConfig()
+    clips = len(store.source("train"))
+    backwards = None
+    if settings.backwards == "on" or (settings.backwards == "measure" and clips < FEW_CLIPS):
+        backwards = reversible(store)
     model = replace(
         model,
         max_frames=source.architecture.frames,
         departures=departures,
         state_heads=None,
+        backwards=backwards,
         sample=replace(model.sample, keep_still=kept),
     )
-    clips = len(store.source("train"))
     own = config.tokenizer_train
+    patience = settings.patience
+    if patience == -1 and len(store.source(held_out(store))) < FEW_HELD_OUT:
+        patience = 0
+    chooses = None
+    if patience:
+        chooses = early_stop(patience, settings.steps)
     tokenizer_steps = 0
     if adapts:
         tokenizer_steps = settings.tokenizer_steps
@@ -190,7 +223,7 @@ def finetuned(
             optimizer=slower(own.optimizer, settings.tokenizer_learning_rate, tokenizer_steps),
             flip=True,  # few recordings are soon learned by heart
             seed=settings.seed,
-            early_stop=early_stop(settings, tokenizer_steps),
+            early_stop=early_stop(patience, tokenizer_steps),
         ),
         train=replace(
             loop,
@@ -199,19 +232,20 @@ def finetuned(
             curriculum=tuple(stages),
             optimizer=slower(loop.optimizer, settings.learning_rate, settings.steps),
             seed=settings.seed,
-            early_stop=early_stop(settings, settings.steps),
+            early_stop=chooses,
         ),
         runtime=replace(
             RuntimeConfig(),
             checkpoint_every=max(1, settings.steps // VALIDATIONS),
+            eval_every=max(LEAST_BETWEEN, settings.steps // VALIDATIONS),
             workers=config.runtime.workers,
         ),
     )
 
 
-def early_stop(settings: Finetuning, steps: int) -> EarlyStopConfig:
-    """Returns when a training of so many steps validates and stops."""
-    return EarlyStopConfig(every=max(LEAST_BETWEEN, steps // VALIDATIONS), patience=settings.patience)
+def early_stop(patience: int, steps: int) -> EarlyStopConfig:
+    """Returns when a training of so many steps validates and stops; never early if patience is not set."""
+    return EarlyStopConfig(every=max(LEAST_BETWEEN, steps // VALIDATIONS), patience=max(patience, 0) or VALIDATIONS)
 
 
 def slower(optimizer: Any, share: float, steps: int) -> Any:

@@ -75,7 +75,7 @@ def test_clips_fit_the_recordings_and_the_model(whole: Run) -> None:
 
 def test_the_run_starts_from_the_model_and_is_like_any_other(whole: Run, model: Path) -> None:
     trained = load(whole.directory)
-    assert trained.config.train.early_stop is not None
+    assert trained.config.train.early_stop is None  # the last weights count: few clips are held out
     assert trained.config.tokenizer_train.steps == SETTINGS.tokenizer_steps  # noise is not reconstructed
     _, start = load_world_model(whole.directory / "start")
     _, own = load_world_model(model)
