@@ -309,6 +309,14 @@ class TokenModelConfig(TransformerConfig, ModelConfig):
     backwards: BackwardsConfig | None = later(None)  # on for few clips, in which a scene seldom moves both ways
     sample: SampleConfig = sampling(SampleConfig())  # how frames are generated; may change after training
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(
+            self.backwards is None or self.state_heads is None,
+            "model.backwards and model.state_heads are on, but a clip that runs backwards has no labels of the state; "
+            "switch one off",
+        )
+
     @property
     def takes_actions(self) -> bool:
         return self.action_encoder != "none"

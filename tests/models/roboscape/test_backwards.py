@@ -1,10 +1,15 @@
 """Token records whose clips run backwards."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from rsjax.config import BackwardsConfig
+from rsjax.config import BackwardsConfig, ConfigError, RoboScapeConfig, StateHeadsConfig, presets
+from rsjax.config.config_fields import with_values
+from rsjax.data.normalization import Normalization
 from rsjax.data.store import Record, encode_clip
+from rsjax.models.base import create_model
 from rsjax.models.roboscape.departures.backwards import drawn_direction, undoing
 from tests.tools.pipeline import toy
 
@@ -43,3 +48,18 @@ def test_a_share_of_the_clips_runs_backwards(record: Record) -> None:
     drawn = [drawn_direction(BackwardsConfig(share=0.25), record, rng) is not record for _ in range(400)]
     assert 70 < sum(drawn) < 130
     assert drawn_direction(None, record, rng) is record
+
+
+def test_a_models_loader_turns_its_clips(record: Record) -> None:
+    config = with_values(toy.config(), {"model.backwards.share": 1.0})
+    normalization = Normalization((0.0,) * 3, (1.0,) * 3, None)
+    arrays = create_model(config).transform(normalization)(record, np.random.default_rng(0))
+    np.testing.assert_array_equal(arrays["rgb"], record["rgb"][::-1])
+
+
+def test_labels_of_the_state_cannot_turn() -> None:
+    model = presets.debug().model
+    assert isinstance(model, RoboScapeConfig)
+    with pytest.raises(ConfigError) as caught:
+        replace(model, backwards=BackwardsConfig(), state_heads=StateHeadsConfig())
+    assert "switch one off" in str(caught.value)

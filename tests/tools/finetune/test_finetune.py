@@ -8,8 +8,16 @@ import jax
 import numpy as np
 import pytest
 
-from rsjax.config import GenieConfig, KeepStillConfig, RoboScapeConfig, content_key, to_dict
-from rsjax.data.store import open_store
+from rsjax.config import (
+    BackwardsConfig,
+    EarlyStopConfig,
+    GenieConfig,
+    KeepStillConfig,
+    RoboScapeConfig,
+    content_key,
+    to_dict,
+)
+from rsjax.data.store import Store, open_store
 from rsjax.errors import UserError
 from rsjax.files import write_json
 from rsjax.models.load_run import load
@@ -18,7 +26,7 @@ from rsjax.models.roboscape.transformer import Transformer
 from rsjax.tools.convert import directory
 from rsjax.tools.convert.directory import load_world_model
 from rsjax.tools.finetune.finetune import finetune, make_clips, prepare
-from rsjax.tools.finetune.recipe import FIXED_CAMERA, Finetuning, Reconstruction, finetuned, moving_share
+from rsjax.tools.finetune.recipe import FIXED_CAMERA, LEAST_BETWEEN, Finetuning, Reconstruction, finetuned, moving_share
 from rsjax.tools.finetune.recordings import Cutting, Recordings, find_recordings
 from rsjax.tools.finetune.start import find_source
 from rsjax.tools.pipeline.run import Run
@@ -150,6 +158,31 @@ def test_the_rule_finds_a_camera_that_stands_still(model: Path, tmp_path: Path) 
     config = prepare(source, store, replace(SETTINGS, tokenizer="keep"), tmp_path / "run")
     assert isinstance(config.model, RoboScapeConfig)
     assert config.model.sample.keep_still == KeepStillConfig()
+
+
+def test_few_clips_run_backwards_if_their_actions_are_known_or_never(whole: Run, model: Path, tmp_path: Path) -> None:
+    source = find_source(model)
+    store = open_store(whole.clips)
+    assert isinstance(whole.config.model, RoboScapeConfig)
+    assert whole.config.model.backwards is None  # nobody says what the numbers mean
+    known = replace(store, manifest=store.manifest | {"action_dimensions": ["x (delta)", "grip (held)"]})
+    settings = SETTINGS.for_clips(source.config, 2)
+
+    def turned(dimensions: Store, chosen: Finetuning) -> BackwardsConfig | None:
+        config = finetuned(source, dimensions, "", chosen, adapts=True)
+        assert isinstance(config.model, RoboScapeConfig)
+        return config.model.backwards
+
+    assert turned(known, settings) == BackwardsConfig(held=(1,))
+    assert turned(known, replace(settings, backwards="off")) is None
+    targets = replace(store, manifest=store.manifest | {"action_dimensions": ["x (absolute)", "grip (held)"]})
+    assert turned(targets, replace(settings, backwards="on")) is None
+
+
+def test_the_best_weights_count_by_word(whole: Run, model: Path) -> None:
+    config = finetuned(find_source(model), open_store(whole.clips), "", replace(SETTINGS, patience=3), adapts=True)
+    assert config.train.early_stop == EarlyStopConfig(every=LEAST_BETWEEN, patience=3)
+    assert whole.config.tokenizer_train.early_stop is not None
 
 
 @pytest.mark.parametrize(("psnr", "kept"), [(30.0, True), (22.0, False), (14.9, False)])
