@@ -72,7 +72,7 @@ def test_nothing_is_moved_without_a_cause() -> None:
     ]
     assert measure_delay(still, "", every=1).frames == 0
     assert measure_delay(episodes(1)[:2], "", every=1) == Delay(())
-    assert Delay((0.30, 0.33)).frames == 0
+    assert Delay((0.38, 0.43)).frames == 0
 
 
 @pytest.fixture(scope="module")
