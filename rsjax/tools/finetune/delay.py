@@ -26,7 +26,7 @@ SIDE = 128  # pixels
 FASTEST = 0.05  # share of the pixels whose mean flow is the motion
 RIDGE = 5.0
 LEAST_EXPLAINED = 0.1  # of the motion's variance by the commands
-MARGIN = 0.07  # by which they have to explain more than as recorded; in simulated Lift, the controller's lag brings 0.05
+MARGIN = 0.07  # by which they have to explain more than as recorded; in simulated Lift a controller's lag brings 0.05
 
 
 @dataclass(frozen=True)
