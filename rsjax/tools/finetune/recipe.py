@@ -150,13 +150,19 @@ def reversible(store: Store) -> BackwardsConfig | None:
     held = []
     dimensions = store.manifest.get("action_dimensions") or []
     for number, line in enumerate(dimensions):
-        if line.endswith("(held)"):
+        if line.endswith(("(held)", "(absolute)")):
             held.append(number)
         elif not line.endswith("(delta)"):
             return None
     if not dimensions:
         return None
     return BackwardsConfig(held=tuple(held))
+
+
+def of_targets(store: Store) -> bool:
+    """Returns whether all actions of the store are targets or states, whose sum means nothing."""
+    dimensions = store.manifest.get("action_dimensions") or []
+    return bool(dimensions) and all(line.endswith(("(held)", "(absolute)")) for line in dimensions)
 
 
 def finetuned(
@@ -178,7 +184,8 @@ def finetuned(
     shifts = model.departures.shifts
     if shifts:
         shifts = max(shifts, COPIES)
-    departures = replace(model.departures, self_conditioning_after=after, shifts=shifts)
+    integrates = model.departures.integrate_actions and not of_targets(store)
+    departures = replace(model.departures, self_conditioning_after=after, shifts=shifts, integrate_actions=integrates)
     kept = None
     if still:
         kept = KeepStillConfig()

@@ -68,6 +68,14 @@ MAPS: dict[str, KeyMap] = {
         held=(6,),
         names=("bridge_dataset", "bridge_orig"),
     ),
+    "bridge_poses": KeyMap(  # the pose that the hand reached and how far it is open, in place of the command
+        _cameras("image_0", "image_1", "image_2", "image_3"),
+        ("observation/state",),
+        5.0,
+        ("observation/state",),
+        kind="absolute",
+        after=True,
+    ),
     "bridge_oxe": KeyMap(
         _cameras("image"),
         (*_OXE_MOVE, "action/open_gripper"),
