@@ -48,7 +48,7 @@ class Options:
     of the pixels move in held-out clips. It changes videos, not the training's losses."""
     backwards: Literal["measure", "on", "off"] = "measure"
     """Let half of the training clips run backwards, with the actions that lead back; measure: if there are fewer than
-    300, and the data set says what its actions are."""
+    300, and their actions are poses or other targets. on: also where they are steps."""
     frames: int = 0
     """Frames of a clip; 0: as many as the model takes, or fewer if episodes are short."""
     rate: float = 0.0
@@ -59,9 +59,9 @@ class Options:
     """The source's own settings, such as kind=delta (docs/formats.md)."""
     depth: str = "recorded"
     """recorded, none, or a network that estimates depth, such as depth-anything:… (docs/annotate.md)."""
-    delay: int = -1
-    """Recorded frames by which commands act later than the data set says; -1: measured on training episodes, by how
-    much of the motion in the picture they explain."""
+    delay: int = 0
+    """Recorded frames by which commands act later than the data set says, and by which clips have them later; -1:
+    measured on training episodes, by how much of the motion in the picture they explain."""
     test_share: float = 0.2
     """Share of the episodes that scores are of; no training sees them."""
     validation_share: float = 0.1

@@ -39,7 +39,7 @@ LEAST_STEPS = 100
 MOST_STEPS = 1500
 MOST_TOKENIZER_STEPS = 600
 FEW_HELD_OUT = 30  # clips; fewer choose among weights by chance
-FEW_CLIPS = 300  # of the training split; with fewer, clips also run backwards
+FEW_CLIPS = 300  # of the training split; with fewer, clips of targets also run backwards
 COPIES = 12  # moved copies of each clip, at least, where the model was trained with some: few clips last longer
 
 
@@ -61,7 +61,7 @@ class Finetuning:
         keep_still: whether videos keep what stands still (:class:`rsjax.config.KeepStillConfig`); measure: if the
             camera stands still (:data:`FIXED_CAMERA`).
         backwards: whether half of the drawn clips run backwards (:class:`rsjax.config.BackwardsConfig`); measure: if
-            there are few (:data:`FEW_CLIPS`) and the data set says what their actions are.
+            there are few (:data:`FEW_CLIPS`) whose actions are targets; on: also of steps, if the data set says so.
     """
 
     steps: int = -1
@@ -191,7 +191,8 @@ def finetuned(
         kept = KeepStillConfig()
     clips = len(store.source("train"))
     backwards = None
-    if settings.backwards == "on" or (settings.backwards == "measure" and clips < FEW_CLIPS):
+    few = clips < FEW_CLIPS and of_targets(store)
+    if settings.backwards == "on" or (settings.backwards == "measure" and few):
         backwards = reversible(store)
     model = replace(
         model,

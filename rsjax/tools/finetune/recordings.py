@@ -59,7 +59,7 @@ class Cutting:
     camera: str = ""
     option: tuple[str, ...] = ()
     depth: str = "recorded"
-    delay: int = -1
+    delay: int = 0
     test_share: float = 0.2
     validation_share: float = 0.1
     split_seed: int = 0
@@ -98,7 +98,7 @@ def ingest_options(
 
     Clips have every n-th frame, so that the rate is 5 Hz or a little more or less, and as many frames as the model has
     positions, or fewer if episodes are short. Where a data set does not say whether actions add up, a clip's action is
-    the recorded ones of its interval, one after another; otherwise they are moved to the motion that they cause.
+    the recorded ones of its interval, one after another.
 
     Args:
         image_size: pixels a side.

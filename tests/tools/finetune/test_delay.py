@@ -15,7 +15,7 @@ from rsjax.tools.ingest.pictures import ArrayFrames
 
 FRAMES = 24
 EPISODES = 5
-CUTTING = Cutting(test_share=0.2, validation_share=0.2, workers=0)
+CUTTING = Cutting(delay=-1, test_share=0.2, validation_share=0.2, workers=0)
 
 
 def recorded(delay: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -93,4 +93,5 @@ def test_clips_have_commands_where_they_act(data: Path, capsys: pytest.CaptureFi
     assert chosen(declared) == ActionConfig(offset=1)
     assert "if they act 1 recorded frame later" in capsys.readouterr().out
     assert chosen(replace(declared, delay=0)) == ActionConfig()
+    assert chosen(replace(declared, delay=2)) == ActionConfig(offset=2)
     assert chosen(CUTTING) == ActionConfig()  # nobody says what the numbers mean

@@ -173,10 +173,27 @@ def test_few_clips_run_backwards_if_their_actions_are_known_or_never(whole: Run,
         assert isinstance(config.model, RoboScapeConfig)
         return config.model.backwards
 
-    assert turned(known, settings) == BackwardsConfig(held=(1,))
-    assert turned(known, replace(settings, backwards="off")) is None
+    assert turned(known, settings) is None  # steps, which nobody knows to act when they are recorded
+    assert turned(known, replace(settings, backwards="on")) == BackwardsConfig(held=(1,))
     targets = replace(store, manifest=store.manifest | {"action_dimensions": ["x (absolute)", "grip (held)"]})
-    assert turned(targets, replace(settings, backwards="on")) is None
+    assert turned(targets, settings) == BackwardsConfig(held=(0, 1))
+    assert turned(targets, replace(settings, backwards="off")) is None
+    turns = replace(store, manifest=store.manifest | {"action_dimensions": ["q (delta, of a quaternion)"]})
+    assert turned(turns, replace(settings, backwards="on")) is None
+
+
+def test_targets_are_not_added_up(whole: Run, model: Path) -> None:
+    source = find_source(model)
+    own = source.config.model
+    assert isinstance(own, RoboScapeConfig)
+    adds = replace(own, departures=replace(own.departures, integrate_actions=True))
+    source = replace(source, config=replace(source.config, model=adds))
+    store = open_store(whole.clips)
+    for kind, added in {"delta": True, "absolute": False}.items():
+        known = replace(store, manifest=store.manifest | {"action_dimensions": [f"x ({kind})", "grip (held)"]})
+        config = finetuned(source, known, "", SETTINGS.for_clips(source.config, 2), adapts=True)
+        assert isinstance(config.model, RoboScapeConfig)
+        assert config.model.departures.integrate_actions is added
 
 
 def test_the_best_weights_count_by_word(whole: Run, model: Path) -> None:

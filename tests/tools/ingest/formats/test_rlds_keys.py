@@ -45,6 +45,14 @@ def test_a_key_map_that_does_not_say_what_actions_are_leaves_them_undeclared(tmp
         assert episode.meta["actions"]["kind"] == kind
 
 
+def test_the_poses_that_the_hand_reached_are_actions_by_name(tmp_path: Path) -> None:
+    write_bridge(tmp_path / "data", [bridge_episode()])
+    episode = read_first("rlds", tmp_path / "data", keys="bridge_poses")
+    assert episode.states is not None
+    np.testing.assert_array_equal(episode.actions[1:], episode.states[1:])
+    assert episode.meta["actions"]["kind"] == "absolute"
+
+
 def test_every_named_map_is_whole() -> None:
     names = [name for keys in MAPS.values() for name in keys.names]
     assert len(names) == len(set(names))
