@@ -1,5 +1,6 @@
 """Convolution layers with float32 parameters and, if wanted, bf16 operands."""
 
+from functools import partial
 from typing import Any, Literal
 
 import flax.linen as nn
@@ -15,7 +16,8 @@ Dtype = Literal["float32", "bfloat16"]
 class Conv(nn.Module):
     """A convolution with a square kernel and float32 parameters; its output has the number format of its input.
 
-    Parameters have the names, shapes and initial values of flax's layer.
+    Parameters have the names, shapes and initial values of flax's layer;
+    :func:`rsjax.layers.platform.with_transformed_kernels` may add one.
     """
 
     features: int
@@ -29,7 +31,9 @@ class Conv(nn.Module):
     def __call__(self, x: Float[Array, "B h w C"]) -> Float[Array, "B h w D"]:
         shape = (self.size, self.size, x.shape[-1], self.features)
         kernel = parameter(self, "kernel", nn.initializers.lecun_normal(), shape)
-        run = convolve if self.bf16 else jax.lax.conv_general_dilated
+        run = jax.lax.conv_general_dilated
+        if self.bf16:
+            run = partial(convolve, transformed=self.get_variable("params", "transformed"))
         strides = (self.stride, self.stride)
         out = run(x, kernel, strides, self.padding, dimension_numbers=("NHWC", "HWIO", "NHWC"))
         if self.use_bias:

@@ -17,9 +17,10 @@ import jax.numpy as jnp
 from jax.extend.backend import backends
 from jaxtyping import Array, Float
 
+from rsjax import runtime
 from rsjax.layers import accelerator, attention
 from rsjax.layers.attention import KeyValues, attend, attend_cached, unpacked
-from rsjax.layers.cpu import convolution, frame_attention
+from rsjax.layers.cpu import convolution, frame_attention, winograd
 from rsjax.layers.cpu import matmul as cpu_matmul
 from rsjax.layers.cpu.cache import put_clip_by_clip
 from rsjax.layers.gpu import attention as gpu
@@ -252,14 +253,39 @@ def convolve(
     kernel: Float[Array, "i j C D"],
     window_strides: Sequence[int],
     padding: Any,
+    transformed: Float[Array, "16 C D"] | None = None,
     **settings: Any,  # axes must be in the order of flax's layers
 ) -> Float[Array, "B h w D"]:
     """Convolves as ``jax.lax.conv_general_dilated`` does, with operands rounded to bf16 where this is faster.
 
     On an accelerator the result is rounded to bf16 too, as in the layers of other libraries.
+
+    Args:
+        transformed: the kernel by :func:`with_transformed_kernels`, of a convolution that keeps the image's size; CPUs
+            read it in place of the kernel where that is faster. It has no gradient for the kernel.
     """
     settings |= {"window_strides": window_strides, "padding": padding}
-    return by_platform(partial(convolution.convolve, **settings), partial(accelerator.convolve, **settings), x, kernel)
+
+    def on_cpu(x: Array, kernel: Array) -> Array:
+        if transformed is not None and winograd.takes(x, transformed):
+            return winograd.convolve_transformed(x, transformed)
+        return convolution.convolve(x, kernel, **settings)
+
+    return by_platform(on_cpu, partial(accelerator.convolve, **settings), x, kernel)
+
+
+def with_transformed_kernels(params: Any) -> Any:
+    """Returns the parameters with "transformed" beside each 3×3 kernel that CPUs can convolve with faster so.
+
+    The convolutions must have stride 1 and round their operands to bf16.
+    """
+    if not isinstance(params, dict):
+        return params
+    if "kernel" not in params:
+        return {name: with_transformed_kernels(inner) for name, inner in params.items()}
+    if runtime.has_bf16_units() and winograd.transforms(params["kernel"]):
+        return params | {"transformed": winograd.transformed_kernel(params["kernel"])}
+    return params
 
 
 def convolve_video(

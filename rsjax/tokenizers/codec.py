@@ -18,7 +18,7 @@ from rsjax.data.depth_color import TOKENIZER_SCALE, color_to_depth, depth_to_col
 from rsjax.data.normalization import Normalization
 from rsjax.devices import divide, map_rows, mesh_of, on_cpu
 from rsjax.layers.platform import by_platform
-from rsjax.tokenizers.magvit2 import run_tokenizer
+from rsjax.tokenizers.magvit2 import for_many_pictures, run_tokenizer
 from rsjax.trainable import Params
 
 Tokens = dict[str, Int[np.ndarray, "B T h w"]]
@@ -169,6 +169,8 @@ def _run(config: TokenizerConfig, method: str, mesh: Mesh | None, params: Params
         return cast(jax.Array, run_tokenizer(config, params, images, method))
 
     def one_by_one(params: Params, images: ArrayLike) -> jax.Array:
+        if method == "decode":
+            params = for_many_pictures(config, params)
         return map_rows(lambda params, image: run(params, image[None])[0], params, images, mesh)
 
     return by_platform(one_by_one, run, params, x)

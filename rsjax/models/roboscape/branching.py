@@ -30,7 +30,7 @@ from rsjax.models.roboscape.departures.second_view import views
 from rsjax.models.roboscape.sample import State, start, step, with_few_launches
 from rsjax.models.roboscape.transformer import Cache
 from rsjax.tokenizers.codec import Codec
-from rsjax.tokenizers.magvit2 import run_tokenizer
+from rsjax.tokenizers.magvit2 import for_many_pictures, run_tokenizer
 from rsjax.trainable import Params
 
 
@@ -74,6 +74,7 @@ class TokenBranching:
         self._arch = arch
         self._codec = codec
         self._params = params
+        self._decoder = jax.jit(for_many_pictures, static_argnums=0)(codec.config, codec.params)
         self._has_depth = arch.depth != "none" and has_depth and codec.normalization.depth_range is not None
         # First states are on the parameters' devices, as are those that passes return, so that one program takes both.
         where = getattr(jax.tree.leaves(params)[0], "sharding", None) or jax.local_devices()[0]
@@ -130,7 +131,7 @@ class TokenBranching:
             sample,
             self._codec.config,
             self._params,
-            self._codec.params,
+            self._decoder,
             tuple(caches),
             tuple(clips),
             rows,

@@ -38,7 +38,7 @@ from rsjax.models.roboscape.sample import (
     with_few_launches,
 )
 from rsjax.tokenizers.codec import Codec, each_pass
-from rsjax.tokenizers.magvit2 import run_tokenizer
+from rsjax.tokenizers.magvit2 import for_many_pictures, run_tokenizer
 from rsjax.trainable import Params
 
 GROUP = 8
@@ -71,6 +71,7 @@ class TokenImagination:
         self._arch = arch
         self._codec = codec
         self._params = jax.jit(for_many_passes, static_argnums=0)(arch, params)
+        self._decoder = jax.jit(for_many_pictures, static_argnums=0)(codec.config, codec.params)
         self._has_depth = arch.depth != "none" and codec.normalization.depth_range is not None
         self._shows_depth = self._has_depth and depth
         self._size = clips
@@ -137,7 +138,7 @@ class TokenImagination:
                 self._codec.config,
                 self._codec.normalization if self._shows_depth else None,
                 self._params,
-                self._codec.params,
+                self._decoder,
                 state,
                 rows[lanes],
             )
