@@ -40,7 +40,7 @@ def convolve_transformed(x: Float[Array, "B h w C"], kernel: BFloat16[Array, "16
     """Convolves with stride 1 and zeros around images of even height and width."""
     images, height, width, channels = x.shape
     padded = jnp.pad(x.astype(jnp.float32), ((0, 0), (1, 1), (1, 1), (0, 0)))
-    products = []
+    products: list[Array] = []
     for rows in _of_tiles(_cells(padded, 1)):
         for cells in _of_tiles(_cells(rows, 2)):
             rounded = jax.lax.optimization_barrier(cells.astype(jnp.bfloat16))

@@ -1,7 +1,7 @@
 """Generates frame by frame from pixels to pixels: one compiled program decodes the tokens, and then their pictures.
 
 On a CPU the program takes ``GROUP`` clips, and groups run at the same time. The features of so few clips stay in the
-processor's cache, a window that is full costs its own group alone, and one program serves any number of clips.
+processor's cache, and one program serves any number of clips. Windows that are full are encoded again clip by clip.
 
 Axes: B clips, N of them, G clips of a group, S cells, A action dimensions.
 """
@@ -43,8 +43,6 @@ from rsjax.trainable import Params
 
 GROUP = 8
 
-_renewed = jax.jit(renewed, static_argnums=(0, 1), donate_argnums=3)  # a program of its own, since few steps need it
-
 
 class TokenImagination:
     """Implements :class:`rsjax.models.base.Imagination`. Frames have depth if the model and its training clips have it.
@@ -75,8 +73,10 @@ class TokenImagination:
         self._has_depth = arch.depth != "none" and codec.normalization.depth_range is not None
         self._shows_depth = self._has_depth and depth
         self._size = clips
+        self._renewed = clips  # clips whose windows one program moves
         if on_cpu():
             self._size = min(clips, GROUP)
+            self._renewed = 1
         self._states: list[State | None] = [None] * -(-clips // self._size)
         self._positions = np.zeros(clips, int)  # the next frame's in each window
         self._sums = np.zeros((clips, len(codec.normalization.action_mean)))
@@ -130,8 +130,10 @@ class TokenImagination:
             state = self._states[number]
             assert state is not None, "restart the clips first"
             lanes = self._lanes(number, count)
-            if full[lanes].any():
-                state = _renewed(self._arch, self._config.sample, self._params, state, full[lanes])
+            for first in range(0, self._size, self._renewed):
+                these = full[lanes[first : first + self._renewed]]
+                if these.any():
+                    state = _with_renewed(self._arch, self._config.sample, self._params, state, first, these)
             self._states[number], rgb, depth = _step(
                 self._arch,
                 self._config.sample,
@@ -202,6 +204,24 @@ def _restarted(which: Bool[Array, " B"], fresh: State, old: State) -> State:
     axes = clip_axes(old)
     stacked: State = jax.vmap(where, (0, axes, axes), axes)(which, fresh, old)
     return stacked
+
+
+@partial(jax.jit, static_argnums=(0, 1), donate_argnums=3)  # a program of its own, since few steps need it
+def _with_renewed(
+    arch: Architecture, sample: SampleConfig, params: Params, state: State, first: int, full: Bool[Array, " N"]
+) -> State:
+    """Returns the state of B clips with the full windows among N of them, from ``first`` on, moved by their stride."""
+
+    def cut(axis: int, part: Any) -> Any:
+        return jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, first, len(full), axis), part)
+
+    def put(axis: int, part: Any, new: Any) -> Any:
+        return jax.tree.map(lambda x, y: jax.lax.dynamic_update_slice_in_dim(x, y, first, axis), part, new)
+
+    axes = clip_axes(state)
+    moved = renewed(arch, sample, params, jax.tree.map(cut, axes, state), full)
+    whole: State = jax.tree.map(put, axes, state, moved)
+    return whole
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2, 3), donate_argnums=(6,))

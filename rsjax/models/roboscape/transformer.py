@@ -121,19 +121,20 @@ class Attention(nn.Module):
         qkv = self._project(x)
         positions = start + jnp.arange(x.shape[1])
         qkv = rotated(cfg.departures, qkv, positions)
-        if cache is None and x.shape[1] <= cfg.frames:
-            out = attend_in_clip(qkv, "frames", cfg.compute_dtype == "bfloat16")
-            return self.proj(out.reshape(x.shape)), None
         q, k, v = unpacked(qkv)
-        if cache is None:
+        frames = x.shape[1]
+        if cache is not None and frames > cache.k.shape[-2]:
+            raise ValueError(f"{frames} frames do not fit a cache of {cache.k.shape[-2]}")
+        begins = isinstance(start, int) and start == 0  # no frame in the cache is before these
+        if (cache is None or begins) and frames <= cfg.frames:
+            out = attend_in_clip(qkv, "frames", cfg.compute_dtype == "bfloat16")
+        elif cache is None:
             q, k, v = (y.swapaxes(1, 2) for y in (q, k, v))
             out = attend(q, k, v, sees(positions, positions, cfg.frames)).swapaxes(1, 2)
+        else:
+            out = attend_over_cache(qkv, cache, start, cfg.frames)
+        if cache is None:
             return self.proj(out.reshape(x.shape)), None
-        frames = x.shape[1]
-        slots = cache.k.shape[-2]
-        if frames > slots:
-            raise ValueError(f"{frames} frames do not fit a cache of {slots}")
-        out = attend_over_cache(qkv, cache, start, cfg.frames)
         new = KeyValues(*(y.transpose(0, 2, 3, 1, 4) for y in (k, v)))  # B S h T e
         return self.proj(out.reshape(x.shape)), new
 
