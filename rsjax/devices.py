@@ -5,6 +5,7 @@ from functools import partial
 from typing import Any, TypeVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.sharding import AxisType, Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
@@ -43,15 +44,20 @@ def divide(batch: Tree, params: Any) -> Tree:
     return jax.tree.map(put, batch)
 
 
-def map_rows(run: Callable[[Any, Any], Any], params: Any, batch: Any, mesh: Mesh | None) -> Any:
+def map_rows(run: Callable[[Any, Any], Any], params: Any, batch: Any, mesh: Mesh | None, count: Any = None) -> Any:
     """Returns the results of ``run(params, row)`` for all rows of a batch; each device runs its own rows one by one.
 
     Args:
         mesh: of a batch that is divided among devices, from :func:`mesh_of`; None: of any other.
+        count: rows of an array on one device that are run, and may be traced; the results of others are 0. None: all.
     """
 
     def on_device(params: Any, rows: Any) -> Any:
-        return jax.lax.map(partial(run, params), rows)
+        if count is None:
+            return jax.lax.map(partial(run, params), rows)
+        of_one = jax.eval_shape(run, params, rows[0])
+        empty = jnp.zeros((len(rows), *of_one.shape), of_one.dtype)
+        return jax.lax.fori_loop(0, count, lambda i, out: out.at[i].set(run(params, rows[i])), empty)
 
     if mesh is None:
         return on_device(params, batch)

@@ -273,7 +273,11 @@ class WorldModel(Trainable[B], Protocol[B]):
         raise UserError(f"{directory}: train.start_from is set, but this family of models starts from no other weights")
 
     def start(self, fresh: Params, saved: Params, directory: Path) -> Params:
-        """Returns the parameters that training begins with: the saved ones, completed by fresh ones."""
+        """Returns the parameters that training begins with: the saved ones, completed by fresh ones.
+
+        Args:
+            fresh: their shapes, which stand for them in the result.
+        """
         return saved
 
     def cache_shapes(self, frames: int) -> Any:

@@ -91,7 +91,11 @@ class Autoencoder(Trainable[B], Protocol[B]):
         raise UserError(f"{directory}: tokenizer_train.start_from is set, but this autoencoder starts from no weights")
 
     def start(self, fresh: Params, saved: Params, directory: Path) -> Params:
-        """Returns the parameters that training begins with: the saved ones, completed by fresh ones."""
+        """Returns the parameters that training begins with: the saved ones, completed by fresh ones.
+
+        Args:
+            fresh: their shapes, which stand for them in the result.
+        """
         return saved
 
     def notes(self) -> list[str]:

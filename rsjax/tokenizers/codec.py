@@ -18,7 +18,7 @@ from rsjax.data.depth_color import TOKENIZER_SCALE, color_to_depth, depth_to_col
 from rsjax.data.normalization import Normalization
 from rsjax.devices import divide, map_rows, mesh_of, on_cpu
 from rsjax.layers.platform import by_platform
-from rsjax.tokenizers.magvit2 import for_many_pictures, run_tokenizer
+from rsjax.tokenizers.magvit2 import run_tokenizer
 from rsjax.trainable import Params
 
 Tokens = dict[str, Int[np.ndarray, "B T h w"]]
@@ -102,17 +102,23 @@ class Codec:
         return depth_to_color(depth, *near_far, TOKENIZER_SCALE).astype(np.uint8)
 
     def _chunked(self, method: Literal["encode", "decode"], images: np.ndarray) -> np.ndarray:
-        def apply(chunk: np.ndarray) -> ArrayLike:
-            x = divide(chunk, self.params)
-            return _run(self.config, method, mesh_of(x), self.params, x)
-
         axes = 3  # of pixels, or of codes
         if method == "decode" and images.dtype != np.float32:
             axes = 2  # of tokens
         side = images.shape[1 - axes]
         if method == "decode":
             side *= self.config.downsampling
-        return in_chunks(apply, images, axes, images_per_pass(side))
+        most = images_per_pass(side)
+
+        def apply(chunk: np.ndarray) -> ArrayLike:
+            if passes_at_once() > 1:  # one program serves any number of images
+                rows = np.zeros((most, *chunk.shape[1:]), chunk.dtype)
+                rows[: len(chunk)] = chunk
+                return _run(self.config, method, None, self.params, rows, np.int32(len(chunk)))[: len(chunk)]
+            x = divide(chunk, self.params)
+            return _run(self.config, method, mesh_of(x), self.params, x)
+
+        return in_chunks(apply, images, axes, most)
 
 
 def images_per_pass(side: int) -> int:
@@ -162,15 +168,25 @@ def passes_at_once() -> int:
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2))
-def _run(config: TokenizerConfig, method: str, mesh: Mesh | None, params: Params, x: ArrayLike) -> ArrayLike:
-    """Encodes or decodes images: on a CPU one by one, so that an image's features stay in the processor's cache."""
+def _run(
+    config: TokenizerConfig,
+    method: str,
+    mesh: Mesh | None,
+    params: Params,
+    x: ArrayLike,
+    count: Int[np.ndarray, ""] | None = None,
+) -> jax.Array:
+    """Encodes or decodes images: on a CPU one by one, so that an image's features stay in the processor's cache.
+
+    Args:
+        count: of a CPU's images, the others are left out; None: all.
+    """
 
     def run(params: Params, images: ArrayLike) -> jax.Array:
         return cast(jax.Array, run_tokenizer(config, params, images, method))
 
     def one_by_one(params: Params, images: ArrayLike) -> jax.Array:
-        if method == "decode":
-            params = for_many_pictures(config, params)
-        return map_rows(lambda params, image: run(params, image[None])[0], params, images, mesh)
+        return map_rows(lambda params, image: run(params, image[None])[0], params, images, mesh, count)
 
-    return by_platform(one_by_one, run, params, x)
+    out: jax.Array = by_platform(one_by_one, run, params, x)
+    return out

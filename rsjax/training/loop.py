@@ -60,7 +60,7 @@ def fit(
         loader: takes a loader's saved state (or None) and returns the loader that continues from it.
         directory: of checkpoints and logs; made if it does not exist.
         name: of the training, for the progress line.
-        start: makes the initial parameters from fresh ones; not called on resuming from a checkpoint.
+        start: as for :meth:`rsjax.training.sharding.Sharding.init`; not called on resuming from a checkpoint.
         resume: False deletes earlier checkpoints.
         stop_at: stop (and save) after this step, as if interrupted.
         validate: scores the weights every ``loop.validate_every`` steps; it affects training only by

@@ -4,7 +4,7 @@ A state is an ordinary tree of arrays in all three cases, so checkpoints do not 
 """
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from math import prod
@@ -22,7 +22,7 @@ from jaxtyping import PyTree
 from rsjax.config import ConfigError, LoopConfig, require
 from rsjax.layers.partition import FSDP
 from rsjax.trainable import Extra, Params, Trainable
-from rsjax.training.state import TrainState, create_state
+from rsjax.training.state import TrainState, create_state, fresh_params
 from rsjax.training.step import Metrics
 
 Tree = TypeVar("Tree")  # a tree of arrays
@@ -104,16 +104,17 @@ class Sharding:
         """Returns :func:`rsjax.training.state.create_state`'s state, created with this sharding.
 
         Args:
-            start: makes the initial parameters from fresh ones.
+            start: makes the initial parameters from the shapes of fresh ones. A shape that it returns stands for the
+                fresh parameter.
 
         Raises:
             ConfigError: no array can be split into ``loop.fsdp`` parts.
         """
-        places = self._shardings(_shapes(model, loop))
+        shapes = _shapes(model, loop)
+        places = self._shardings(shapes)
         initial = None
         if start is not None:
-            fresh = jax.jit(lambda: model.init(jax.random.key(loop.seed)), out_shardings=places.params)()
-            initial = _place(start(fresh), places.params)
+            initial = _completed(start(shapes.params), places.params, model, loop)
         return self._make(model, loop)(initial, _place(model.init_extra(), places.extra))
 
     @lru_cache(maxsize=KEPT)  # noqa: B019 - a sharding is a value
@@ -122,7 +123,7 @@ class Sharding:
 
         def make(initial: Params | None, extra: Extra) -> TrainState:
             # Arrays from disk are arguments, so that they do not become constants of the compiled program.
-            state = create_state(model, loop, None if initial is None else lambda _: initial)
+            state = create_state(model, loop, initial)
             return state.replace(extra=extra)  # type: ignore[attr-defined]
 
         return jax.jit(make, out_shardings=self._shardings(_shapes(model, loop)), donate_argnums=(0, 1))
@@ -241,8 +242,28 @@ class Sharding:
         return jax.tree.map(lambda _: place, tree)
 
 
+@lru_cache(maxsize=KEPT)
 def _shapes(model: Trainable[Any], loop: LoopConfig) -> TrainState:
     return jax.eval_shape(lambda: create_state(model, loop))
+
+
+def _completed(started: Params, places: PyTree, model: Trainable[Any], loop: LoopConfig) -> Params:
+    """Puts fresh parameters in place of shapes, and all into the shardings ``places``.
+
+    Only these are drawn, since a program that draws all parameters takes seconds to compile.
+    """
+    is_fresh = [isinstance(x, jax.ShapeDtypeStruct) for x in jax.tree.leaves(started)]
+
+    def draw() -> list[jax.Array]:
+        leaves = jax.tree.leaves(fresh_params(model, loop))
+        return [x for x, fresh in zip(leaves, is_fresh, strict=True) if fresh]
+
+    drawn: Iterator[jax.Array] = iter(())
+    if any(is_fresh):
+        where = [place for place, fresh in zip(jax.tree.leaves(places), is_fresh, strict=True) if fresh]
+        drawn = iter(jax.jit(draw, out_shardings=where)())
+    completed = jax.tree.map(lambda x: next(drawn) if isinstance(x, jax.ShapeDtypeStruct) else x, started)
+    return _place(completed, places)
 
 
 def _place(tree: Tree, places: PyTree) -> Tree:

@@ -1,6 +1,5 @@
 """The training state, the optimizer and the learning rate schedule."""
 
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -94,17 +93,21 @@ def _matrices(params: Params) -> Params:
     return jax.tree.map_with_path(axes, params)
 
 
-def create_state(
-    model: Trainable[Any], loop: LoopConfig, start: Callable[[Params], Params] | None = None
-) -> TrainState:
-    """Returns the state before the first step, which depends only on the configuration and ``start``.
+def fresh_params(model: Trainable[Any], loop: LoopConfig) -> Params:
+    """Returns the parameters of a network that starts from nothing."""
+    params: Params = model.init(jax.random.key(loop.seed))
+    return params
+
+
+def create_state(model: Trainable[Any], loop: LoopConfig, initial: Params | None = None) -> TrainState:
+    """Returns the state before the first step, which depends only on the configuration and the initial parameters.
 
     Args:
-        start: makes the initial parameters from fresh ones; None: fresh ones are used.
+        initial: None: fresh parameters.
     """
-    params = model.init(jax.random.key(loop.seed))
-    if start is not None:
-        params = start(params)
+    params = initial
+    if params is None:
+        params = fresh_params(model, loop)
     ema = jax.tree.map(jnp.copy, params) if loop.ema else None  # a copy: donated buffers must not be shared
     return TrainState(
         step=jnp.int32(0),

@@ -1,5 +1,6 @@
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import jax
 import numpy as np
@@ -83,3 +84,15 @@ def test_a_videos_depth_is_that_of_the_clips_that_have_it(codec: Codec) -> None:
     np.testing.assert_array_equal(again.depth[0], codec.decode_depth(tokens["depth"][0]))
     assert codec.encode(Video(rgb)).keys() == {"rgb"} and codec.encode(video[1:]).keys() == {"rgb"}
     assert codec.decode(tokens, np.zeros(2, bool)).depth is None
+
+
+def test_one_program_serves_any_number_of_images(codec: Codec) -> None:
+    frames = np.random.default_rng(0).integers(0, 256, (11, 64, 64, 3), np.uint8)
+    whole = codec.encode_rgb(frames)
+    pictures = codec.decode_rgb(whole)
+    program: Any = module._run
+    programs = program._cache_size()
+    for count in (1, 2, 5):
+        np.testing.assert_array_equal(codec.encode_rgb(frames[:count]), whole[:count])
+        np.testing.assert_array_equal(codec.decode_rgb(whole[:count]), pictures[:count])
+    assert program._cache_size() == programs

@@ -240,18 +240,11 @@ def _step(
         arch, lambda arch: step(arch, sample, params, state, actions[:, None], beyond=False)
     )
 
-    def pixels(branch: str) -> Array:
-        grids = frame[branch].reshape(len(actions), arch.grid, arch.grid, *frame[branch].shape[3:])
-        return _decoded(tokenizer, tokenizer_params, grids)
-
-    rgb = jnp.round(pixels("rgb")).astype(jnp.uint8)
+    has_depth = normalization is not None and normalization.depth_range is not None
+    cells = [frame[branch] for branch in ("rgb", "depth")[: 1 + has_depth]]
+    grids = jnp.concatenate([x.reshape(len(actions), arch.grid, arch.grid, *x.shape[3:]) for x in cells])
+    pictures: Array = run_tokenizer(tokenizer, tokenizer_params, grids, "decode")
+    rgb = jnp.round(pictures[: len(actions)]).astype(jnp.uint8)
     if normalization is None or normalization.depth_range is None:
         return state, rgb, None
-    return state, rgb, color_to_depth(pixels("depth"), *normalization.depth_range, TOKENIZER_SCALE)
-
-
-@partial(jax.jit, static_argnums=0)  # so that it is traced once for both branches
-def _decoded(config: TokenizerConfig, params: Params, grids: Array) -> Array:
-    """Returns the pictures of tokens or codes."""
-    pictures: Array = run_tokenizer(config, params, grids, "decode")
-    return pictures
+    return state, rgb, color_to_depth(pictures[len(actions) :], *normalization.depth_range, TOKENIZER_SCALE)
