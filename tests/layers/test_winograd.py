@@ -46,16 +46,21 @@ def test_a_layer_reads_the_transformed_kernel_and_rounds_little_more() -> None:
 
 
 @pytest.mark.usefixtures("bf16_units")
-def test_odd_and_very_large_images_are_convolved_as_before(monkeypatch: pytest.MonkeyPatch) -> None:
-    for height, width, most in ((7, 6, winograd.MOST), (6, 7, winograd.MOST), (6, 6, 1000)):
-        monkeypatch.setattr(winograd, "MOST", most)
-        each, params, x = layer(height, width, CHANNELS)
-        out = each.apply({"params": with_transformed_kernels(params)}, x)
-        np.testing.assert_array_equal(out, each.apply({"params": params}, x))
+@pytest.mark.parametrize(("height", "width"), [(7, 6), (6, 7)])
+def test_images_of_odd_sizes_are_convolved_as_before(height: int, width: int) -> None:
+    each, params, x = layer(height, width, CHANNELS)
+    out = each.apply({"params": with_transformed_kernels(params)}, x)
+    np.testing.assert_array_equal(out, each.apply({"params": params}, x))
+
+
+def test_images_whose_products_would_leave_the_cache_are_not_taken() -> None:
+    kernel = jnp.zeros((16, 128, 128))
+    assert winograd.takes(jnp.zeros((1, 64, 64, 128)), kernel)
+    assert not winograd.takes(jnp.zeros((1, 256, 256, 128)), kernel)
 
 
 @pytest.mark.usefixtures("bf16_units")
-def test_other_kernels_stay_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_other_kernels_stay_alone() -> None:
     narrow = {"kernel": jnp.zeros((3, 3, 18, 64))}
     small = {"kernel": jnp.zeros((1, 1, 64, 64))}
     norm = {"scale": jnp.zeros(64)}
@@ -67,5 +72,3 @@ def test_other_kernels_stay_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     }
     wide = {"kernel": jnp.zeros((3, 3, 64, 64))}
     assert "transformed" in with_transformed_kernels(wide)
-    monkeypatch.setattr("rsjax.runtime.has_bf16_units", lambda: False)
-    assert set(with_transformed_kernels(wide)) == {"kernel"}
