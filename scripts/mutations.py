@@ -50,7 +50,7 @@ RESUME = ("test_loop.py", "test_checkpoint.py", "test_loader.py")
 MUTATIONS = (
     Mutation(
         "masking: the frames before the first masked one are masked too",
-        "rate = jnp.where(jnp.arange(frames) >= first_masked, rate, 0.0)",
+        "rate = jnp.where(jnp.arange(frames) >= first, rate, 0.0)",
         "rate = jnp.where(jnp.arange(frames) >= 0, rate, 0.0)",
         MASKING,
     ),

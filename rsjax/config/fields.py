@@ -140,9 +140,6 @@ def _plain(value: Any) -> Any:
 def from_dict(kind: type[T], values: dict[str, Any]) -> T:
     """Returns the config that :func:`to_dict` made these values from. Missing fields take their defaults.
 
-    Fields of earlier versions that a class names in ``retired`` are ignored. Those in its ``constants`` must have the
-    values that are constants now; content keys still count them, so that what these versions made keeps its key.
-
     Raises:
         ConfigError: ``values`` or a nested value is not a dictionary; a field is unknown, as in a file written by
             another version, or its value of another type; or the configuration is impossible.
@@ -155,15 +152,7 @@ def from_dict(kind: type[T], values: dict[str, Any]) -> T:
     hints = {f.name: declared[f.name] for f in dataclasses.fields(typing.cast(Any, kind))}
     if "kind" not in hints and hasattr(kind, "kind"):
         values = {name: value for name, value in values.items() if name != "kind"}
-    constants = getattr(kind, "constants", {})
-    for name, value in constants.items():
-        require(
-            values.get(name, value) == value,
-            f"{kind.__name__}.{name} is {values.get(name)!r:.40}, but always {value!r} in this version; use the one "
-            f"that wrote the file",
-        )
-    former = {*getattr(kind, "retired", ()), *constants}
-    values = {name: value for name, value in values.items() if name not in former}
+    values = {name: value for name, value in values.items() if name not in getattr(kind, "retired", ())}
     unknown = set(values) - set(hints)
     require(not unknown, f"{kind.__name__} has no field {', '.join(sorted(unknown))}; the file is of another version")
     return kind(**{name: _read(f"{kind.__name__}.{name}", hints[name], value) for name, value in values.items()})
@@ -233,5 +222,4 @@ def _content(part: Any) -> Any:
         return part
     deciding = [f for f in dataclasses.fields(part) if not f.metadata.keys() & {"runtime", "sampling"}]
     kept = [f.name for f in deciding if "later" not in f.metadata or getattr(part, f.name) != f.default]
-    constants = getattr(part, "constants", {})
-    return {"": type(part).__name__} | constants | {name: _content(getattr(part, name)) for name in kept}
+    return {"": type(part).__name__} | {name: _content(getattr(part, name)) for name in kept}

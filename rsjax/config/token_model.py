@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 from rsjax.config.data import ClipShape
 from rsjax.config.fields import later, loss_weights, require, require_range, runtime, sampling
@@ -81,8 +81,6 @@ class Departures:
     :class:`LossConfig`, and ``model.action_encoder`` "norms".
     """
 
-    constants: ClassVar[dict[str, Any]] = {"visible_prefix": 0.0}  # see rsjax.config.from_dict
-
     # Input of the network.
     # The action encoder also reads the sum of all actions so far, which doubles its input. For small models whose
     # actions are pose deltas: the sum is the pose, which a large model finds by temporal attention.
@@ -110,6 +108,8 @@ class Departures:
     # Copies of each training clip, moved by a few pixels. A step draws one of them or the clip. Few clips last longer
     # with copies: a scene that is moved by less than a token has new tokens everywhere.
     shifts: int = 0
+    # The share of the clips in which all frames before a random one stay visible, as past frames are in sampling.
+    visible_prefix: float = 0.0
     # With whole_frames: after self_conditioning_after steps, in this share of the steps, every frame is predicted from
     # the model's own prediction of the frame before (its mean codes), as in a rollout. Such a step takes a third more
     # work.
@@ -124,7 +124,7 @@ class Departures:
     visible_keypoints: bool = False
 
     def __post_init__(self) -> None:
-        require_range(self, "model.departures", 0, 1, "self_conditioning")
+        require_range(self, "model.departures", 0, 1, "visible_prefix", "self_conditioning")
         require_range(self, "model.departures", 0, math.inf, "shifts", "embedding_std", "self_conditioning_after")
         require(
             0 <= self.action_dropout < 1,
@@ -140,6 +140,11 @@ class Departures:
             self.whole_frames or not self.self_conditioning,
             f"model.departures.self_conditioning is {self.self_conditioning}, but without whole_frames no single pass "
             f"predicts all frames; switch that on, or set self_conditioning to 0",
+        )
+        require(
+            not (self.whole_frames and self.visible_prefix),
+            f"model.departures.visible_prefix is {self.visible_prefix}, but whole_frames leaves no frame visible after "
+            f"the first; set one of them to 0 or False",
         )
 
 

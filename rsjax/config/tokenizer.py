@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 from rsjax.config.fields import fitting_sizes, require, require_range
 from rsjax.config.train import TrainConfig
@@ -13,8 +13,6 @@ HINGE = 0.5  # weight of the discriminator's hinge loss, as in the reference
 @dataclass(frozen=True)
 class TokenizerConfig:
     """MAGVIT-2 encoder and decoder with lookup-free quantisation (reference: Open-MAGVIT2)."""
-
-    constants: ClassVar[dict[str, Any]] = {"depth_scale": "inverse"}  # see rsjax.config.from_dict
 
     patch_size: int = 1  # space-to-depth before the first convolution; 1 as in MAGVIT-2, larger is cheaper
     channels: int = 128  # of the first level; times its multiplier, of each other one
@@ -30,6 +28,8 @@ class TokenizerConfig:
     local_codes: bool = False
     code_bits: int = 18  # D: one token is D bits, a vocabulary of 2^D; fewer are easier to predict, and coarser
     vocabularies: int = 2  # n: the vocabulary of 2^D is factorised into n of 2^(D/n)
+    # The paper tokenizes depth with the same MAGVIT-2; its colour map is unpublished (see rsjax/data/depth_color.py).
+    depth_scale: Literal["linear", "inverse"] = "inverse"
 
     # bfloat16: operands of convolutions, and on an accelerator the features between layers; norms, latents and losses
     # stay float32. CPUs without bf16 units still convolve in float32, which is faster there. The public code trains in

@@ -14,7 +14,6 @@ from jaxtyping import Float, Float32
 from rsjax.clip import Array
 
 Scale = Literal["linear", "inverse"]
-TOKENIZER_SCALE: Scale = "inverse"  # of what the tokenizer reads: finer near the camera, where the robot is
 RELATIVE_FAR = 10.0  # depth of the farthest point of a video whose depth has no unit; the nearest is 1
 
 

@@ -3,7 +3,6 @@
 from typing import Any
 
 from rsjax.config import TokenizerConfig, content_key
-from rsjax.data.depth_color import TOKENIZER_SCALE
 from rsjax.data.store import Store, StoreError, open_store
 
 FOLDER = "tokens"  # in the store of clips
@@ -18,7 +17,7 @@ def tokenizer_key(config: Any, weights: str, *shifts: int) -> str:
         weights: fingerprint of the tokenizer's weights.
         shifts: how many shifted copies of a clip there are and how far they are shifted, if there are any.
     """
-    settings = TOKENIZER_SCALE if isinstance(config, TokenizerConfig) else config
+    settings = config.depth_scale if isinstance(config, TokenizerConfig) else config
     return content_key("tokenizer", weights, settings, *shifts)
 
 

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from rsjax.clip import Video
 from rsjax.config import TokenizerConfig
-from rsjax.data.depth_color import TOKENIZER_SCALE, color_to_depth, depth_to_color
+from rsjax.data.depth_color import color_to_depth, depth_to_color
 from rsjax.data.normalization import Normalization
 from rsjax.devices import divide, map_rows, mesh_of, on_cpu
 from rsjax.layers.platform import by_platform
@@ -95,11 +95,11 @@ class Codec:
         """
         near, far = self.normalization.require_depth_range()
         colors = self._chunked("decode", np.asarray(tokens))
-        return color_to_depth(colors, near, far, TOKENIZER_SCALE)
+        return color_to_depth(colors, near, far, self.config.depth_scale)
 
     def _colors(self, depth: Float[np.ndarray, "*B H W"]) -> UInt8[np.ndarray, "*B H W 3"]:
         near_far = self.normalization.require_depth_range()
-        return depth_to_color(depth, *near_far, TOKENIZER_SCALE).astype(np.uint8)
+        return depth_to_color(depth, *near_far, self.config.depth_scale).astype(np.uint8)
 
     def _chunked(self, method: Literal["encode", "decode"], images: np.ndarray) -> np.ndarray:
         axes = 3  # of pixels, or of codes

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Key, UInt8
 from rsjax.config import Config, ConfigError, ModelConfig, TokenizerConfig, TokenizerTrainConfig, from_dict, require
 from rsjax.config.fields import differences
 from rsjax.data.codec import Record
-from rsjax.data.depth_color import TOKENIZER_SCALE, depth_to_color
+from rsjax.data.depth_color import depth_to_color
 from rsjax.data.loader import Arrays, Transform
 from rsjax.data.normalization import Normalization
 from rsjax.errors import UserError
@@ -36,7 +36,7 @@ Latents: TypeAlias = Float[Array, "B h w D"]
 ENTROPY_TEMPERATURE = 0.01  # of the codes' probabilities in the entropy loss, as in the reference
 
 # Fields that may differ between the saved tokenizer and the one to train.
-FREE = {"vocabularies", "compute_dtype"}
+FREE = {"vocabularies", "depth_scale", "compute_dtype"}
 
 
 @dataclass(frozen=True)
@@ -154,7 +154,8 @@ class TokenizerTraining(Autoencoder[Images]):
 
     def transform(self) -> Transform:
         train = self.train
-        return TokenizerImages(train.frames_per_clip, train.depth_share, TOKENIZER_SCALE, train.flip, self.second_view)
+        scale = self.tokenizer.depth_scale
+        return TokenizerImages(train.frames_per_clip, train.depth_share, scale, train.flip, self.second_view)
 
     def batch(self, arrays: Arrays) -> UInt8[np.ndarray, "B H W 3"]:
         return image_batch(arrays)

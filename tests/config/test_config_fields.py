@@ -24,13 +24,7 @@ class Newer:
     word: str = later("own")
 
 
-@dataclasses.dataclass(frozen=True)
-class Settled:
-    constants: ClassVar[dict[str, Any]] = {"rate": 1.0}
-
-
 Newer.__name__ = Older.__name__  # as a class of another version
-Settled.__name__ = Older.__name__
 
 
 def flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -169,10 +163,3 @@ def test_a_later_field_leaves_the_keys_of_what_older_versions_made() -> None:
     assert content_key(Newer(), 1) == content_key(Older(), 1)
     assert content_key(Newer(2.0), 1) != content_key(Newer(), 1)
     assert content_key(Newer(word="estimated"), 1) != content_key(Newer(), 1)
-
-
-def test_a_field_that_became_a_constant_is_read_at_its_value_alone_and_stays_in_content_keys() -> None:
-    assert from_dict(Settled, to_dict(Older())) == Settled()
-    assert content_key(Settled()) == content_key(Older())
-    with pytest.raises(ConfigError, match=r"Older.rate is 2.0, but always 1.0 in this version"):
-        from_dict(Settled, to_dict(Older(rate=2.0)))

@@ -117,6 +117,8 @@ def test_two_families_of_one_name_are_refused() -> None:
 def test_frames_that_are_masked_whole_must_be_read_otherwise() -> None:
     with pytest.raises(ConfigError, match="read_previous is off"):
         Departures(whole_frames=True)
+    with pytest.raises(ConfigError, match="model.departures.visible_prefix is 0.5"):
+        Departures(read_previous=True, whole_frames=True, visible_prefix=0.5)
 
 
 def test_own_frames_need_whole_frames_and_are_a_share() -> None:

@@ -142,7 +142,7 @@ def test_training_starts_from_a_saved_tokenizer_with_or_without_a_discriminator(
     other = replace(training, tokenizer=replace(CONFIG, norm_groups=8))
     with pytest.raises(UserError, match="norm_groups is 4 there, 8 here"):
         other.pretrained_shapes(tmp_path)
-    free = replace(training, tokenizer=replace(CONFIG, vocabularies=1))
+    free = replace(training, tokenizer=replace(CONFIG, vocabularies=1, depth_scale="linear"))
     assert jax.tree.map(jnp.shape, free.pretrained_shapes(tmp_path)) == jax.tree.map(jnp.shape, fresh)
     with pytest.raises(UserError, match="holds no tokenizer/weights with their settings"):
         training.pretrained_shapes(tmp_path / "empty")

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from rsjax.clip import Video
 from rsjax.config import SampleConfig, TokenizerConfig, TokenModelConfig
-from rsjax.data.depth_color import TOKENIZER_SCALE, color_to_depth
+from rsjax.data.depth_color import color_to_depth
 from rsjax.data.normalization import Normalization, with_sums
 from rsjax.devices import on_cpu
 from rsjax.layers.unstacked_params import unstack_params
@@ -247,4 +247,4 @@ def _step(
     rgb = jnp.round(pictures[: len(actions)]).astype(jnp.uint8)
     if normalization is None or normalization.depth_range is None:
         return state, rgb, None
-    return state, rgb, color_to_depth(pictures[len(actions) :], *normalization.depth_range, TOKENIZER_SCALE)
+    return state, rgb, color_to_depth(pictures[len(actions) :], *normalization.depth_range, tokenizer.depth_scale)

@@ -3,7 +3,8 @@
 1. Every sub-token of every frame, including the first, becomes a random code with probability rate·u, u ~ U(0, 1).
 2. With this probability: f ~ U{P, …, T-1} and r ~ U(keep, 1); in each frame ≥ f, r shrinks by U(decay, 1) and
    sub-tokens become random with probability 1 - r. Otherwise f = 1. (P: prompt frames.)
-3. In frames ≥ f, each cell is masked with probability cos(πv/2), v ~ U(0, 1) drawn per clip and frame.
+3. In frames ≥ f, each cell is masked with probability cos(πv/2), v ~ U(0, 1) drawn per clip and frame. The departure
+   ``visible_prefix`` draws a later f for some clips.
 
 u, f and r are drawn per batch; everything else is drawn per clip from its place in the global batch, so that the draws
 do not depend on the clip's device.
@@ -17,6 +18,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Int
 
 from rsjax.config import CorruptionConfig
+from rsjax.models.roboscape.departures.visible_prefix import after_prefix
 from rsjax.tokenizers import lfq
 
 KEEP = 0.25  # step 2's constants, from the public Genie
@@ -35,6 +37,7 @@ class Masked:
 
 def corrupt(
     config: CorruptionConfig | None,
+    visible_prefix: float,
     prompt_frames: int,
     code_bits: int,
     vocabularies: int,
@@ -46,6 +49,7 @@ def corrupt(
 
     Args:
         config: of steps 1 and 2; None: without both, f = 1.
+        visible_prefix: as in :class:`rsjax.config.Departures`.
         prompt_frames: P, the first frames, which step 2 leaves alone.
         key: the step's key, the same on all devices.
         tokens: clean tokens by branch.
@@ -68,9 +72,10 @@ def corrupt(
                 random = jax.random.randint(code_key, sub_tokens.shape, 0, codes, sub_tokens.dtype)
                 where = jax.random.uniform(where_key, sub_tokens.shape) < rates[:, None, None, None]
                 noisy[branch] = lfq.merge_tokens(jnp.where(where, random, sub_tokens), code_bits)
+        first = after_prefix(visible_prefix, mask_key, frames, first_masked)
         rate_key, cell_key = jax.random.split(mask_key)
         rate = jnp.cos(jnp.pi / 2 * jax.random.uniform(rate_key, (frames,)))
-        rate = jnp.where(jnp.arange(frames) >= first_masked, rate, 0.0)
+        rate = jnp.where(jnp.arange(frames) >= first, rate, 0.0)
         drawn = jax.random.uniform(cell_key, next(iter(clip.values())).shape)
         return Masked(noisy, drawn < rate[:, None, None])
 

@@ -88,6 +88,7 @@ class RoboScape(WorldModel[Batch]):
         targets = {branch: getattr(batch, branch) for branch in arch.modalities}
         corrupted = masking.corrupt(
             self.config.corruption,
+            departures.visible_prefix,
             self.prompt_frames,
             arch.code_bits,
             arch.vocabularies,

@@ -80,7 +80,7 @@ def test_each_modality_is_scored_on_its_own_clean_tokens_where_masked(
     has = np.ones(3, np.float32) if has_depth is None else np.array(has_depth, np.float32)
     batch = batch.replace(has_depth=None if has_depth is None else has)  # type: ignore[attr-defined]
     clean = {name: jnp.asarray(getattr(batch, name)) for name in model.modalities}
-    corrupt = jax.jit(partial(masking.corrupt, CORRUPTION, 1, model.code_bits, model.vocabularies))
+    corrupt = jax.jit(partial(masking.corrupt, CORRUPTION, 0.0, 1, model.code_bits, model.vocabularies))
     given = corrupt(KEY, clean, batch.index)
     inputs = (given.tokens, given.mask, batch.actions)
     logits, _ = jax.jit(Transformer(model).apply)({"params": params}, *inputs, no_depth=has == 0)

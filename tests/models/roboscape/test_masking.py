@@ -19,9 +19,9 @@ STEP_2 = CorruptionConfig(random_token_rate=0.0)
 PROMPT = {STEP_1: 1, STEP_2: 4}  # frames given at generation
 
 
-@partial(jax.jit, static_argnums=0)
-def corrupt_one(config: CorruptionConfig, key: jax.Array, tokens: Any, index: Any) -> Masked:
-    return corrupt(config, PROMPT[config], BITS, VOCABULARIES, key, tokens, index)
+@partial(jax.jit, static_argnums=(0, 4))
+def corrupt_one(config: CorruptionConfig, key: jax.Array, tokens: Any, index: Any, prefix: float = 0.0) -> Masked:
+    return corrupt(config, prefix, PROMPT[config], BITS, VOCABULARIES, key, tokens, index)
 
 
 dropped = jax.jit(dropped_actions, static_argnums=0)
@@ -33,11 +33,11 @@ def clean(clips: int, branches: tuple[str, ...] = ("rgb", "depth")) -> dict[str,
 
 
 @cache
-def run(config: CorruptionConfig) -> tuple[Masked, dict[str, np.ndarray], np.ndarray]:
+def run(config: CorruptionConfig, prefix: float = 0.0) -> tuple[Masked, dict[str, np.ndarray], np.ndarray]:
     """Many batches: corrupted tokens and masks, the clean tokens, and which sub-tokens of RGB have changed."""
     tokens = clean(CLIPS)
     keys = jax.random.split(jax.random.key(1), BATCHES)
-    each = [corrupt_one(config, key, tokens, jnp.arange(CLIPS)) for key in keys]
+    each = [corrupt_one(config, key, tokens, jnp.arange(CLIPS), prefix) for key in keys]
     out = jax.tree.map(lambda *x: np.stack(x), *each)
     changed = np.stack([(out.tokens["rgb"] >> shift & 511) != (tokens["rgb"] >> shift & 511) for shift in (0, 9)], -1)
     return out, tokens, changed
@@ -140,3 +140,12 @@ def test_dropped_actions_follow_a_clips_place_too(seed: int) -> None:
 def test_the_given_share_of_actions_is_dropped() -> None:
     drop = dropped(0.2, jax.random.key(0), jnp.arange(4000))
     assert np.mean(drop) == pytest.approx(0.2, abs=0.02)
+
+
+def test_a_visible_prefix_ends_at_a_frame_drawn_per_clip_and_changes_nothing_else() -> None:
+    before, after = (run(STEP_1, prefix)[0].mask for prefix in (0.0, 0.5))
+    masked = after.any((-1, -2))  # batches, clips, T
+    first = np.where(masked.any(-1), masked.argmax(-1), T)
+    np.testing.assert_array_equal(after, before & (np.arange(T) >= first[..., None])[..., None, None])
+    assert np.mean(first > 1) == pytest.approx(0.5 * (T - 2) / (T - 1), abs=0.06)
+    assert set(range(1, T)) <= set(np.unique(first))

@@ -73,7 +73,7 @@ def test_an_exported_tokenizer_carries_its_configuration(tmp_path: Path) -> None
     write_safetensors(tmp_path / "in.safetensors", TOKENIZER, {})
     convert("tokenizer", tmp_path / "in.safetensors", tmp_path / "own")
     config, params = load_tokenizer(tmp_path / "own")
-    other = replace(config, norm_groups=8, compute_dtype="bfloat16")
+    other = replace(config, norm_groups=8, depth_scale="linear")
     save(tmp_path / "other", other, params)
     convert("tokenizer", "--export", tmp_path / "other", tmp_path / "x.safetensors")
     convert("tokenizer", tmp_path / "x.safetensors", tmp_path / "again")

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from rsjax.config import Config, EarlyStopConfig, EvalConfig, NoDepth
 from rsjax.data.clips import readable
-from rsjax.data.depth_color import TOKENIZER_SCALE, depth_to_color
+from rsjax.data.depth_color import depth_to_color
 from rsjax.data.loader import Arrays, Transform
 from rsjax.data.normalization import Normalization
 from rsjax.data.store import Record, StoreError, write_store
@@ -123,7 +123,7 @@ def test_the_tokenizer_scores_as_its_codec_does(run: Run) -> None:
     codec = toy.codec(run.open_clips())
     clips = [clip for _, clip in readable(run.open_clips().source("test"))]
     rgb, depth = (np.stack([clip[name] for clip in clips]) for name in ("rgb", "depth"))
-    colors = depth_to_color(depth, *toy.DEPTH_RANGE, TOKENIZER_SCALE)
+    colors = depth_to_color(depth, *toy.DEPTH_RANGE, run.config.tokenizer.depth_scale)
     found = TokenizerValidation(run)(3, codec.params)
     of_rgb = float(psnr(rgb, codec.decode_rgb(codec.encode_rgb(rgb))).mean())
     of_depth = float(psnr(colors, codec.decode_rgb(codec.encode_depth(depth))).mean())
