@@ -103,7 +103,8 @@ def load_part(directory: Path, part: Part, like: Tree) -> Tree:
         if shapes[0] != shapes[1]:
             raise ModelFileError(f"{path}: {name} is {shapes[0]}, the configuration needs {shapes[1]}; {AGAIN}")
     arrays = [saved[name].astype(x.dtype) for name, x in wanted.items()]
-    return jax.device_put(jax.tree_util.tree_unflatten(structure, arrays))
+    # On a device by name, as orbax restores weights: programs for weights that may be anywhere would be others.
+    return jax.device_put(jax.tree_util.tree_unflatten(structure, arrays), jax.local_devices()[0])
 
 
 def save_directory(
