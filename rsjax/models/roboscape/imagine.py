@@ -240,11 +240,15 @@ def _step(
         arch, lambda arch: step(arch, sample, params, state, actions[:, None], beyond=False)
     )
 
-    has_depth = normalization is not None and normalization.depth_range is not None
-    cells = [frame[branch] for branch in ("rgb", "depth")[: 1 + has_depth]]
+    near_far = None
+    cells = [frame["rgb"]]
+    if normalization is not None and normalization.depth_range is not None:
+        near_far = normalization.depth_range
+        cells.append(frame["depth"])
+    # RGB and depth in one pass, so that the decoder is compiled once.
     grids = jnp.concatenate([x.reshape(len(actions), arch.grid, arch.grid, *x.shape[3:]) for x in cells])
     pictures: Array = run_tokenizer(tokenizer, tokenizer_params, grids, "decode")
     rgb = jnp.round(pictures[: len(actions)]).astype(jnp.uint8)
-    if normalization is None or normalization.depth_range is None:
+    if near_far is None:
         return state, rgb, None
-    return state, rgb, color_to_depth(pictures[len(actions) :], *normalization.depth_range, tokenizer.depth_scale)
+    return state, rgb, color_to_depth(pictures[len(actions) :], *near_far, tokenizer.depth_scale)

@@ -204,8 +204,10 @@ def finetuned(
     )
     own = config.tokenizer_train
     patience = settings.patience
-    if patience == -1 and len(store.source(held_out(store))) < FEW_HELD_OUT:
-        patience = 0
+    if patience == -1:
+        patience = VALIDATIONS
+        if len(store.source(held_out(store))) < FEW_HELD_OUT:
+            patience = 0
     chooses = None
     if patience:
         chooses = early_stop(patience, settings.steps)
@@ -231,7 +233,7 @@ def finetuned(
             optimizer=slower(own.optimizer, settings.tokenizer_learning_rate, tokenizer_steps),
             flip=True,  # few recordings are soon learned by heart
             seed=settings.seed,
-            early_stop=early_stop(patience, tokenizer_steps),
+            early_stop=early_stop(patience or VALIDATIONS, tokenizer_steps),
         ),
         train=replace(
             loop,
@@ -252,8 +254,8 @@ def finetuned(
 
 
 def early_stop(patience: int, steps: int) -> EarlyStopConfig:
-    """Returns when a training of so many steps validates and stops; never early if patience is not set."""
-    return EarlyStopConfig(every=max(LEAST_BETWEEN, steps // VALIDATIONS), patience=max(patience, 0) or VALIDATIONS)
+    """Returns when a training of so many steps validates and stops."""
+    return EarlyStopConfig(every=max(LEAST_BETWEEN, steps // VALIDATIONS), patience=patience)
 
 
 def slower(optimizer: Any, share: float, steps: int) -> Any:
