@@ -132,16 +132,17 @@ def test_a_clip_keeps_the_original_name_of_its_episode(command: Command, tmp_pat
 def test_a_command_that_is_stopped_goes_on(command: Command, tmp_path: Path, number: int, status: int) -> None:
     source = folder_of_episodes(tmp_path / "source", 40)
     line = ["folder", source, "--out", tmp_path / "store", *SMALL]
-    words = [sys.executable, "-m", "experiments.ingest", *map(str, line), "--workers", "2"]
+    words = [sys.executable, "-m", "experiments.ingest", *map(str, line), "--workers", "1"]
     with subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as process:
-        while not list(tmp_path.rglob("items/**/*.json")):
+        while not list(tmp_path.glob("store.work/items/**/*.json")):
             assert process.poll() is None
             time.sleep(0.01)
         process.send_signal(number)
         _, text = process.communicate()
     assert process.returncode == status and text.count("\n") == 1 and "the same command resumes" in text
     marks = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("items/**/*.json")}
-    assert 0 < len(marks) < 200 and not (tmp_path / "store").exists()
+    # All 200 are there if the machine was so busy that the signal came while the clips were packed.
+    assert 0 < len(marks) <= 200 and not (tmp_path / "store").exists()
     text = command(ingest, *line, "--workers", 0, "--keep-clips")
     assert f"this run  {200 - len(marks)} work items" in text
     assert {path: path.stat().st_mtime_ns for path in marks} == marks
