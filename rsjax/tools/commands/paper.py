@@ -37,6 +37,8 @@ class Options:
     """The preset that the trainings vary."""
     seeds: int = 3
     """Trainings of each arm."""
+    first_seed: int = 0
+    """The first of the seeds, which count up; 3 with --seeds 2 trains the fourth and fifth."""
     vary: Literal["auto", "model", "everything"] = "auto"
     """What differs between the seeds: the training of the model alone, or clips and tokenizer too. Default: everything
     from a budget of 12 hours on, where it costs little."""
@@ -56,6 +58,7 @@ def main() -> None:
     tune_process()
     options = parse_options(sys.argv[1:], PROG, Options.__doc__ or "", Options())
     require(options.seeds >= 1, f"--seeds is {options.seeds}; it must be at least 1")
+    require(options.first_seed >= 0, f"--first-seed is {options.first_seed}; it must be at least 0")
     given = {f"eval.{name}": getattr(options, name) for name in FILES if getattr(options, name)}
     preset = with_values(presets.get(options.preset), given)
     # This import loads JAX, so it comes after the arguments have been parsed.
@@ -73,7 +76,8 @@ def main() -> None:
     if options.size:
         size = parse_duration(options.size, "--size")
     sizes = scale(preset, size)
-    plan = make_plan(wanted, replace(sizes, seconds=seconds), options.data_dir, options.seeds, vary)
+    seeds = range(options.first_seed, options.first_seed + options.seeds)
+    plan = make_plan(wanted, replace(sizes, seconds=seconds), options.data_dir, seeds, vary)
     command = shlex.join([*PROG.split(), *sys.argv[1:]])
     run.print_plan(plan, options.dir, options.data_dir)
     if options.dry_run:

@@ -19,6 +19,8 @@ class Options:
     """First copy what a study has measured for these claims."""
     study: Path = Path("runs/paper")
     """The directory of rsjax paper that --add takes the claims from."""
+    merge: bool = False
+    """--add keeps the trainings in the file whose seeds the study lacks."""
     run: tuple[Path, ...] = ()
     """First write the scores of these finished runs, which differ in their seeds."""
     name: str = ""
@@ -38,8 +40,9 @@ def main() -> None:
     named = len(options.add) + bool(options.run)
     require(not options.name or named == 1, f"--name names one file, but --add and --run write {named}")
     require(not options.run or bool(options.name), "--run needs --name, the name of its file, such as tiny")
+    require(not options.merge or bool(options.add), "--merge is for --add")
     for claim in options.add:
-        print(result_pages.add_result(root, options.study, claim, options.name))
+        print(result_pages.add_result(root, options.study, claim, options.name, merge=options.merge))
     if options.run:
         print(result_pages.add_runs(root, options.run, options.name))
     if options.check:

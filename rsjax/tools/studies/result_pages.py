@@ -21,7 +21,7 @@ from rsjax.tools.pipeline.run import Run
 from rsjax.tools.studies import run_results, softness
 from rsjax.tools.studies.paper.claim_tables import claim_content, claim_figure, claim_tables
 from rsjax.tools.studies.paper.report import RESULTS
-from rsjax.tools.studies.paper.result_files import KIND, about_result, content_key, read_result
+from rsjax.tools.studies.paper.result_files import KIND, about_result, content_key, merge_result, read_result
 from rsjax.tools.studies.tables import as_markdown
 from rsjax.tools.studies.transcribed import transcribed_table
 
@@ -69,21 +69,25 @@ def part_of(root: Path, name: str, part: str) -> str:
     return as_markdown(tables[part], aligned=False) + below
 
 
-def add_result(root: Path, study: Path, claim: str, name: str = "") -> Path:
+def add_result(root: Path, study: Path, claim: str, name: str = "", *, merge: bool = False) -> Path:
     """Copies what a study measured for a claim to the files of results, and returns the new file.
 
     Args:
         study: a directory of ``rsjax paper``.
         name: the new file's name; empty: the claim's.
+        merge: keep the trainings of the file whose seeds the study lacks.
 
     Raises:
-        UserError: the study has no finished training of the claim.
+        UserError: the study has no finished training of the claim, or cannot be merged with the file.
     """
     source = study / RESULTS / f"{claim}.json"
     if not source.exists():
         known = [path.stem for path in (study / RESULTS).glob("*.json")]
         raise UserError(f"--add {claim!r}: {source}: no such file{did_you_mean(claim, known)} (rsjax paper writes it)")
     path = root / DATA / f"{name or claim}.json"
+    if merge:
+        merge_result(path, source)
+        return path
     for suffix in (".json", ".npz"):
         path.with_suffix(suffix).unlink(missing_ok=True)
         if source.with_suffix(suffix).exists():

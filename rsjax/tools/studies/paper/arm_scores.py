@@ -126,6 +126,38 @@ def read_arm(claim: Claim, name: str, plan: Plan, known: Mapping[str, RunResult]
     )
 
 
+def merge_arms(one: ArmScores, other: ArmScores) -> ArmScores:
+    """Returns the scores of the trainings of both, by seed; of two with the same seed, that of ``other``."""
+    sides = {seed: (arm, row) for arm in (one, other) for row, seed in enumerate(arm.seeds)}
+    ordered = [sides[seed] for seed in sorted(sides)]
+    names = dict.fromkeys([*one.numbers, *other.numbers])
+    numbers = {
+        name: [arm.numbers[name][row] if name in arm.numbers else None for arm, row in ordered] for name in names
+    }
+    scores: dict[str, dict[str, Scored]] = {}
+    for source in dict.fromkeys([*one.scores, *other.scores]):
+        by_name = [arm.scores.get(source, {}) for arm in (one, other) if arm.seeds]
+        scores[source] = {}
+        for name in dict.fromkeys(name for each in by_name for name in each):
+            reason = next((each[name].reason for each in by_name if name in each and each[name].reason), "")
+            if not reason and all(name in each for each in by_name):
+                rows = tuple(arm.scores[source][name].rows[row] for arm, row in ordered)
+                scores[source][name] = Scored(rows)
+            else:
+                scores[source][name] = Scored(reason=reason or f"some seeds have no score named {name}")
+    minutes = [arm.minutes for arm, _ in ordered if arm.minutes is not None]
+    return replace(
+        other if other.seeds else one,
+        planned=max(one.planned, other.planned, len(ordered)),
+        seeds=tuple(sorted(sides)),
+        trainings=tuple(arm.trainings[row] for arm, row in ordered),
+        clips=tuple(arm.clips[row] for arm, row in ordered),
+        numbers=numbers,
+        scores=scores,
+        minutes=round(sum(minutes) / len(minutes), 1) if minutes else None,
+    )
+
+
 def _numbers(claim: Claim, finished: Sequence[RunResult], read: ReadScores) -> dict[str, list[float | None]]:
     """Returns the scores over all clips: of the claim's metrics, of baselines, and those shown beside them."""
     compared = dict.fromkeys([*(each.metric for each in claim.comparisons), *claim.shown])

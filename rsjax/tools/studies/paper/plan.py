@@ -78,7 +78,7 @@ class Plan:
 
 
 def make_plan(
-    claims: Sequence[Claim], scale: Scale, data: Path, seeds: int = budget.SEEDS, vary: Vary = "model"
+    claims: Sequence[Claim], scale: Scale, data: Path, seeds: Sequence[int] = range(budget.SEEDS), vary: Vary = "model"
 ) -> Plan:
     """Returns the cells of claims, which share the budget, and the tasks in their order.
 
@@ -87,7 +87,7 @@ def make_plan(
 
     Args:
         data: the directory of simulated data sets.
-        seeds: the number of trainings of each arm.
+        seeds: of the trainings of each arm.
         vary: what differs between the trainings of an arm.
     """
     absent: dict[tuple[str, str], str] = {}
@@ -96,10 +96,10 @@ def make_plan(
     made = set[str]()
     first = [claim for claim in claims if not claim.rank]
     others = [claim for claim in claims if claim.rank]
-    few = range(seeds)[:VERDICT_SEEDS]
-    more = range(seeds)[VERDICT_SEEDS:]
+    few = seeds[:VERDICT_SEEDS]
+    more = seeds[VERDICT_SEEDS:]
     ordered = [
-        *((claim, arm, seed) for claim in first for seed in range(seeds) for arm in claim.arms),
+        *((claim, arm, seed) for claim in first for seed in seeds for arm in claim.arms),
         *((claim, arm, seed) for claim in others for seed in few for arm in claim.arms),
         *((claim, arm, seed) for seed in more for claim in others for arm in claim.arms),
     ]

@@ -17,7 +17,7 @@ import numpy as np
 from rsjax.files import FileError, read_json, write_file
 from rsjax.tools.pipeline.provenance import read_starts
 from rsjax.tools.pipeline.run import Run
-from rsjax.tools.studies.paper.arm_scores import CLIP_DIGITS, ArmScores, Scored, rounded
+from rsjax.tools.studies.paper.arm_scores import CLIP_DIGITS, ArmScores, Scored, merge_arms, rounded
 from rsjax.tools.studies.paper.claim import Arm, Claim, Comparison
 from rsjax.tools.studies.paper.judge import Outcome, judge_claim
 
@@ -31,15 +31,14 @@ def write_result(path: Path, outcome: Outcome, about: Mapping[str, Any], most: i
 
     Args:
         path: of the JSON file.
-        about: the command and the sizes of the study.
+        about: the command and the sizes of the study, and its :func:`provenance`.
         most: the size from which the clips' scores are written beside it.
 
     Raises:
         FileError: the disk is full.
     """
     claim = outcome.claim
-    runs = [result.run for arm in outcome.arms for result in arm.finished]
-    content: dict[str, Any] = {"kind": KIND, **about, **provenance(runs)}
+    content: dict[str, Any] = {"kind": KIND, **about}
     content["claim"] = {name: getattr(claim, name) for name in OF_CLAIM}
     content["claim"]["comparisons"] = [asdict(each) for each in claim.comparisons]
     content["arms"] = [_arm_content(arm, claim.arm(arm.name)) for arm in outcome.arms]
@@ -82,6 +81,36 @@ def read_result(path: Path) -> Outcome:
         return judge_claim(claim, [_arm_scores(arm, path.with_suffix(".npz")) for arm in arms])
     except (KeyError, TypeError, ValueError) as error:
         raise FileError(f"{path}: damaged or of another version ({error!r}); add it again from its study") from error
+
+
+def merge_result(path: Path, study: Path) -> None:
+    """Adds the trainings of a study's file to a file of results of the same claim.
+
+    A study may be divided among machines by its seeds. Where both files have a training with the same seed, the study's
+    counts.
+
+    Raises:
+        FileError: a file is missing or damaged, or the two differ in what they compare or in the sizes of trainings.
+    """
+    before = read_json(path)
+    after = read_json(study)
+    for what, one, other in (
+        ("claims", before["claim"]["comparisons"], after["claim"]["comparisons"]),
+        ("arms", [arm["name"] for arm in before["arms"]], [arm["name"] for arm in after["arms"]]),
+        ("sizes of trainings", before["sizes"], after["sizes"]),
+    ):
+        if one != other:
+            raise FileError(
+                f"{study}: its {what} differ from those of {path}; add it without --merge or by another --name"
+            )
+    ours = read_result(path)
+    theirs = read_result(study)
+    arms = [merge_arms(one, other) for one, other in zip(ours.arms, theirs.arms, strict=True)]
+    about = {name: after[name] for name in ("command", "preset", "budget", "sizes")}
+    about |= {name: list(dict.fromkeys([*before[name], *after[name]])) for name in ("commits", "machines")}
+    days = sorted(day for content in (before, after) for day in content["dates"].split(" to "))
+    about["dates"] = " to ".join(dict.fromkeys([days[0], days[-1]]))
+    write_result(path, judge_claim(theirs.claim, arms), about)
 
 
 def about_result(path: Path) -> str:

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -138,6 +139,41 @@ def test_a_file_gives_the_tables_of_the_scores_that_it_was_written_from(
     assert read.judged[1].clips == CLIPS - 1 and read.judged[2].reason == "with: no 48 frames yet"
 
 
+def some_seeds(whole: ArmScores, rows: slice) -> ArmScores:
+    """An arm with some of its finished seeds."""
+    scores = {name: Scored(scored.rows[rows]) for name, scored in whole.scores[""].items()}
+    numbers = {name: values[rows] for name, values in whole.numbers.items()}
+    parts = {name: getattr(whole, name)[rows] for name in ("seeds", "trainings", "clips")}
+    return replace(whole, planned=len(parts["seeds"]), numbers=numbers, scores={"": scores}, **parts)
+
+
+@pytest.mark.parametrize("clips", [(), OWN], ids=["the same clips", "clips of each seed"])
+def test_seeds_of_two_machines_are_judged_as_those_of_one(tmp_path: Path, clips: tuple[str, ...]) -> None:
+    arms = [replace(arm(name, gain, clips=clips), steps=430) for name, gain in (("with", 0.5), ("without", 0.0))]
+    claim = toy.claim("toy", Comparison("psnr", "with", "without"))
+    sizes = {"command": "the command", "preset": "tiny", "budget": "1 h", "sizes": {"episodes": 9}}
+
+    def written(name: str, *, date: str = "2026-01-02", rows: slice = slice(None), **more: Any) -> Path:
+        path = tmp_path / f"{name}.json"
+        found = judge_claim(claim, [some_seeds(each, rows) for each in arms])
+        about = {**sizes, "commits": [name], "machines": ["2 cores"], "dates": date, **more}
+        result_files.write_result(path, found, about)
+        return path
+
+    ours = written("ours", rows=slice(2))
+    theirs = written("theirs", rows=slice(1, None), date="2026-01-01 to 2026-01-03")
+    result_files.merge_result(ours, theirs)
+    assert tables(result_files.read_result(ours)) == tables(judge_claim(claim, arms))
+    assert "commit ours, theirs; 2 cores; 2026-01-01 to 2026-01-03" in result_files.about_result(ours)
+    nothing_yet = written("nothing", rows=slice(0))
+    result_files.merge_result(nothing_yet, theirs)
+    assert result_files.read_result(nothing_yet).arms[0].seeds == arms[0].seeds[1:]
+    before = ours.read_bytes()
+    with pytest.raises(result_files.FileError) as error:
+        result_files.merge_result(ours, written("larger", sizes={"episodes": 10}))
+    assert "sizes of trainings differ" in str(error.value) and ours.read_bytes() == before
+
+
 def test_a_damaged_file_is_one_line(tmp_path: Path) -> None:
     path = tmp_path / "toy.json"
     path.write_text('{"arms": [], "claim": {"name": "toy"}}')
@@ -150,7 +186,8 @@ def test_a_study_becomes_a_file_a_table_and_a_figure(tmp_path: Path) -> None:
     study = tmp_path / "study"
     (study / "results").mkdir(parents=True)
     found = outcome(Comparison("psnr", "with", "without"), with_=arm("with", 0.5), without=arm("without"))
-    result_files.write_result(study / "results" / "toy.json", found, {"command": "the command"})
+    about = result_files.provenance([])
+    result_files.write_result(study / "results" / "toy.json", found, about)
     root = tmp_path / "root"
     folder = root / result_pages.FOLDER
     (root / result_pages.DATA).mkdir(parents=True)
@@ -166,7 +203,7 @@ def test_a_study_becomes_a_file_a_table_and_a_figure(tmp_path: Path) -> None:
     with Image.open(folder / "mine.png") as image:
         assert image.width > 200
     result_files.write_result(
-        study / "results" / "toy.json", judge_claim(found.claim, [arm("with", 0.4), arm("without")]), {}
+        study / "results" / "toy.json", judge_claim(found.claim, [arm("with", 0.4), arm("without")]), about
     )
     result_pages.add_result(root, study, "toy", "mine")
     assert any("figure was not drawn" in line for line in result_pages.differences(root))

@@ -238,14 +238,16 @@ def test_a_trial_of_the_rate_multiplies_that_of_the_base_preset() -> None:
 
 
 def test_more_seeds_are_more_trainings() -> None:
-    plan = make_plan(chosen(["table2"], claims()), scale(TINY, HOUR), DATA, seeds=5)
+    plan = make_plan(chosen(["table2"], claims()), scale(TINY, HOUR), DATA, seeds=range(5))
     assert [cell.config.train.seed for cell in plan.of("table2", "full")] == [0, 1, 2, 3, 4]
+    last = make_plan(chosen(["table2"], claims()), scale(TINY, HOUR), DATA, seeds=range(3, 5))
+    assert last.of("table2", "full") == plan.of("table2", "full")[3:]
 
 
 def test_seeds_of_everything_have_their_own_clips_and_tokenizers_which_their_arms_share() -> None:
     at = scale(TINY, 3 * HOUR)
     claim = chosen(["table2"], claims())
-    model, everything = (make_plan(claim, at, DATA, seeds=3, vary=vary) for vary in ("model", "everything"))
+    model, everything = (make_plan(claim, at, DATA, seeds=range(3), vary=vary) for vary in ("model", "everything"))
     made = [Run(cell.config, Path(), DATA).keys() for cell in everything.cells.values()]
     for stage, number in (("collect", 3), ("tokenizer", 3), ("world_model", 12)):
         assert len({keys[stage] for keys in made}) == number

@@ -316,7 +316,7 @@ def test_seconds_a_frame_stand_beside_each_arm(tmp_path: Path, monkeypatch: pyte
 def test_weights_of_metrics_that_come_later_train_nothing_again(tmp_path: Path, sound: bool) -> None:
     """But the marks of the runs that are there must have the same content keys."""
     first, later = (
-        make_plan([toy.claim()], Scale(HOUR, with_values(presets.debug(), {"eval.weights": file})), Path("data"), 1)
+        make_plan([toy.claim()], Scale(HOUR, with_values(presets.debug(), {"eval.weights": file})), Path("data"), [0])
         for file in ("", "elsewhere")
     )
     assert not first.cells.keys() & later.cells.keys()
