@@ -21,7 +21,7 @@ train: setup  ## simulate, train, generate, evaluate, report: the preset tiny
 test: setup  ## the tests
 	@$(python) -m pytest $(in_parallel) $(ARGS)
 
-wheel-test:  ## the wheel alone, in an empty environment outside the checkout: demo, generate, play, serve
+wheel-test:  ## the wheel alone, in an empty environment outside the checkout: demo, generate, finetune, play, serve
 	@scripts/wheel.sh
 
 extras: setup  ## the optional packages (networks, PyTorch, Rerun, a browser), and the tests that want them
