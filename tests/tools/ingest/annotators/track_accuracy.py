@@ -1,6 +1,6 @@
 """Measures how exact Lucas–Kanade tracks and depth colours are on a simulator's clips, as docs/annotate.md reports.
 
-python -m tests.tools.ingest.annotators.track_accuracy data/lift-ff4aeba8a88b318e --split test
+python -m tests.tools.ingest.annotators.track_accuracy data/lift-46219f98a81b280a --split test
 """
 
 import argparse
