@@ -32,6 +32,7 @@ COLUMNS = (
     "cube_error_widths",
     "gripper_error_widths",
 )
+HEADLINE = ("psnr", "psnr_motion", "delta_psnr", "depth_absrel")  # the columns of the README's table
 LIFTED = "lifted_accuracy"
 PROBES = (
     "contact_false_success",
@@ -81,13 +82,16 @@ def _without_seeds(value: Any) -> Any:
 
 
 def run_tables(content: Mapping[str, Any]) -> dict[str, Table]:
-    """Returns the tables of a file: "scores" and, where the model was probed, "contacts".
+    """Returns the tables of a file: "scores", "headline" (a few of their columns) and, with probes, "contacts".
 
     Their rows are the prediction and what it is compared with, as means over the runs. The share of clips in which
     "lifted" is read correctly has Wilson's interval over the clips of all runs.
     """
     measured = {name for run in content["runs"] for name in run["metrics"]}
-    tables = {"scores": _table(content, [name for name in COLUMNS if name in measured], LIFTED in measured)}
+    tables = {
+        "scores": _table(content, [name for name in COLUMNS if name in measured], LIFTED in measured),
+        "headline": _table(content, [name for name in HEADLINE if name in measured], lifted=False),
+    }
     if probes := [name for name in PROBES if name in measured]:
         tables["contacts"] = _table(content, probes, lifted=False)
     return tables

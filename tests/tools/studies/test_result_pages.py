@@ -87,6 +87,9 @@ def test_a_run_becomes_a_file_and_the_table_of_its_scores(root: Path, debug: Pat
     interval = wilson(right, 2)
     assert prediction[-1] == f"{right / 2:.0%} ({interval.low:.0%} … {interval.high:.0%}) |".replace("%", " %")
     assert lines[-1].startswith("Preset `debug`, 1 run (seed 0), 2 held-out clips; commit ")
+    head, _, shorter, *_ = (line.split(" | ") for line in part_of(root, "tiny", "headline").splitlines())
+    assert head[:4] == lines[0].split(" | ")[:4] and shorter[:4] == prediction[:4]
+    assert len(head) == len(shorter) == 5 and shorter[4].removesuffix(" |") == f"{metrics['depth_absrel']:.4f}"
 
 
 def test_the_runs_of_a_file_are_finished(root: Path, debug: Path, tmp_path: Path) -> None:
