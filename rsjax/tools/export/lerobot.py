@@ -160,7 +160,15 @@ def _write(store: Store, root: Path, options: LeRobotOptions, report: Callable[[
         for _, clip in readable(store.source(name)):
             if layout is None:
                 layout = _layout(store, clip, root, options)
-            episode = _episode(clip, layout)
+            actions = clip["actions"]
+            columns: dict[str, Shaped[np.ndarray, "T ..."]] = {"action": np.concatenate([actions[1:], actions[-1:]])}
+            state = layout.features.get(STATE)
+            if state is not None and state["names"] == list(ZEROS):
+                columns[STATE] = np.zeros((len(actions), len(ZEROS)), np.float32)
+            elif state is not None:
+                columns[STATE] = actions
+            if "next.success" in layout.features:
+                columns |= outcome_columns(clip["success"])
             if clip["rgb"].shape[1:] != (layout.video.size, layout.video.size, 3):
                 raise StoreError(f"{store.path}: has clips of several sizes; export them from stores of their own")
             if not options.fps and not keeps_rate(clip, store.manifest, layout.video.fps):
@@ -172,7 +180,7 @@ def _write(store: Store, root: Path, options: LeRobotOptions, report: Callable[[
             cameras[_camera(clip)] = None
             if clip["provenance"].get("source") == GENERATED:
                 generated.append(layout.episodes)
-            layout.add(episode)
+            layout.add(LeRobotEpisode({layout.cameras[0]: clip["rgb"]}, columns, str(clip["task"])))
             report(layout.episodes, total)
         if layout is not None and layout.episodes > begins:
             splits[name] = f"{begins}:{layout.episodes}"
@@ -216,16 +224,3 @@ def _layout(store: Store, clip: Record, root: Path, options: LeRobotOptions) -> 
 
 def _camera(clip: Record) -> str:
     return "".join(c if c.isalnum() else "_" for c in str(clip["provenance"].get("camera") or "image"))
-
-
-def _episode(clip: Record, layout: LayoutV30 | LayoutV21) -> LeRobotEpisode:
-    actions = clip["actions"]
-    columns: dict[str, Shaped[np.ndarray, "T ..."]] = {"action": np.concatenate([actions[1:], actions[-1:]])}
-    state = layout.features.get(STATE)
-    if state is not None and state["names"] == list(ZEROS):
-        columns[STATE] = np.zeros((len(actions), len(ZEROS)), np.float32)
-    elif state is not None:
-        columns[STATE] = actions
-    if "next.success" in layout.features:
-        columns |= outcome_columns(clip["success"])
-    return LeRobotEpisode({layout.cameras[0]: clip["rgb"]}, columns, str(clip["task"]))

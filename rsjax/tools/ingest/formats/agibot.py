@@ -83,7 +83,17 @@ class AgiBot:
 
     def episodes(self) -> Iterator[EpisodeRef]:
         """Lists every episode on disk or in ``task_info``, task by task; an episode not on disk cannot be read."""
-        for task in self._tasks():
+        info = self._root / "task_info"
+        observations = self._root / "observations"
+        if not exists(info) and not exists(observations):
+            raise SourceError(f"{self._root}: has neither task_info nor observations; unpack the data set")
+        tasks = {path.stem.removeprefix("task_") for path in info.glob("task_*.json")}
+        for folder in (self._root / name for name in _FOLDERS):
+            if exists(folder):
+                tasks |= {path.name for path in subfolders(folder)}
+        if absent := [task for task in self._only if task not in tasks]:
+            raise SourceError(f"{self._root}: has no task {absent[0]}; it has {', '.join(sorted(tasks))}")
+        for task in sorted(self._only or tasks, key=lambda name: (len(name), name)):
             path = self._root / "task_info" / f"task_{task}.json"
             entries: dict[str, dict[str, Any]] = {}
             try:
@@ -127,12 +137,22 @@ class AgiBot:
             hands = align_actions(hands, after=proprio.copied())
             actions = np.concatenate([hands, align_actions(proprio.grippers())], 1)
         folder = inside(self._root, f"observations/{place}")
-        segments, bad = _segments(location["segments"], len(times))
+        segments = []
+        bad_segments = []
+        for entry in location["segments"]:
+            try:
+                start = int(entry["start_frame"])
+                end = min(int(entry["end_frame"]), len(times))
+                if not 0 <= start < end:
+                    raise ValueError(f"{start} … {end}")
+                segments.append(Segment(start, end, words_of(entry.get("action_text")), words_of(entry.get("skill"))))
+            except (KeyError, TypeError, ValueError):
+                bad_segments.append(entry)
         depth, why_not = _depth(folder / "depth", len(times))
         unnamed = "names no such episode, so it has no task"
         if location["told"]:
             unnamed = ""
-        notes = {"task_info": unnamed, "bad_segments": bad, "depth_left_out": why_not, **proprio.notes}
+        notes = {"task_info": unnamed, "bad_segments": bad_segments, "depth_left_out": why_not, **proprio.notes}
         episode = Episode(
             id=ref.id,
             fingerprint=ref.fingerprint,
@@ -143,7 +163,7 @@ class AgiBot:
             states=states,
             cameras={name: VideoFrames(media(folder / "videos" / f"{name}_color.mp4")) for name in self._cameras},
             depth={"head": depth} if depth and "head" in self._cameras else {},
-            segments=segments,
+            segments=tuple(sorted(segments, key=lambda segment: segment.start)),
             meta={
                 "task_id": location["task"],
                 "episode_id": location["episode"],
@@ -153,19 +173,6 @@ class AgiBot:
             },
         )
         return checked(episode, path)
-
-    def _tasks(self) -> list[str]:
-        info = self._root / "task_info"
-        observations = self._root / "observations"
-        if not exists(info) and not exists(observations):
-            raise SourceError(f"{self._root}: has neither task_info nor observations; unpack the data set")
-        tasks = {path.stem.removeprefix("task_") for path in info.glob("task_*.json")}
-        for folder in (self._root / name for name in _FOLDERS):
-            if exists(folder):
-                tasks |= {path.name for path in subfolders(folder)}
-        if absent := [task for task in self._only if task not in tasks]:
-            raise SourceError(f"{self._root}: has no task {absent[0]}; it has {', '.join(sorted(tasks))}")
-        return sorted(self._only or tasks, key=lambda name: (len(name), name))
 
     def _ref(self, task: str, identity: str, entry: dict[str, Any]) -> EpisodeRef:
         labels = entry.get("label_info")
@@ -322,22 +329,6 @@ class Proprio:
         if name == "timestamp":
             return rows
         return rows.astype(np.float64)
-
-
-def _segments(entries: list[Any], count: int) -> tuple[tuple[Segment, ...], list[Any]]:
-    """Returns the data set's own segments of the episode, and the entries that are not valid segments."""
-    good = []
-    bad = []
-    for entry in entries:
-        try:
-            start = int(entry["start_frame"])
-            end = min(int(entry["end_frame"]), count)
-            if not 0 <= start < end:
-                raise ValueError(f"{start} … {end}")
-            good.append(Segment(start, end, words_of(entry.get("action_text")), words_of(entry.get("skill"))))
-        except (KeyError, TypeError, ValueError):
-            bad.append(entry)
-    return tuple(sorted(good, key=lambda segment: segment.start)), bad
 
 
 def _depth(folder: Path, count: int) -> tuple[PictureFiles | None, str]:

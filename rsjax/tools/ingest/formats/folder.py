@@ -23,7 +23,6 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -287,23 +286,23 @@ def read_description(path: Path, count: int) -> tuple[str, float, tuple[Segment,
         task = values.get("task")
         if not 0 <= fps <= MAX_FPS or not isinstance(task, str | None):
             raise ValueError(f"fps {fps}, task {task!r}")
-        segments = [_segment(path, place, entry, count) for place, entry in enumerate(values.get("segments") or ())]
+        segments = []
+        for place, entry in enumerate(values.get("segments") or ()):
+            try:
+                segment = Segment(
+                    int(entry["start"]), int(entry["end"]), words_of(entry["text"]), words_of(entry.get("skill"))
+                )
+            except (AttributeError, KeyError, TypeError, ValueError) as error:
+                raise EpisodeError.at(path, f"segment {place}: field missing or wrong ({error})", "mend it") from error
+            if not 0 <= segment.start < segment.end <= count:
+                problem = f"segment {place} is {segment.start} … {segment.end}, there are {count} frames"
+                raise EpisodeError.at(path, problem, "mend it")
+            segments.append(segment)
     except SourceError as error:
         raise EpisodeError(str(error)) from error
     except (AttributeError, TypeError, ValueError) as error:
         raise EpisodeError.at(path, f"task, fps or segments are wrong ({error})", "mend the file") from error
     return words_of(task), fps, tuple(sorted(segments, key=lambda segment: segment.start))
-
-
-def _segment(path: Path, place: int, entry: Any, count: int) -> Segment:
-    try:
-        segment = Segment(int(entry["start"]), int(entry["end"]), words_of(entry["text"]), words_of(entry.get("skill")))
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise EpisodeError.at(path, f"segment {place}: field missing or wrong ({error})", "mend it") from error
-    if not 0 <= segment.start < segment.end <= count:
-        problem = f"segment {place} is {segment.start} … {segment.end}, there are {count} frames"
-        raise EpisodeError.at(path, problem, "mend it")
-    return segment
 
 
 def find_cameras(files: Sequence[Path], flat: bool) -> tuple[dict[str, Frames], dict[str, Depths]]:

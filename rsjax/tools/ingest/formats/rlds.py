@@ -124,7 +124,17 @@ class RldsSource:
 
     def episodes(self) -> Iterator[EpisodeRef]:
         """Lists every record of every shard; one unreadable entry stands for all that a damaged shard lacks."""
-        expected = _expected(self.folder)
+        expected: dict[str, int] = {}  # how many records each shard should have, as far as dataset_info.json says
+        path = self.folder / "dataset_info.json"
+        info = _read_object(path)
+        try:
+            for split in info.get("splits", []):
+                lengths = split.get("shardLengths", [])
+                for number, length in enumerate(lengths):
+                    name = f"{info.get('name')}-{split.get('name')}.tfrecord-{number:05d}-of-{len(lengths):05d}"
+                    expected[name] = int(length)
+        except (AttributeError, TypeError, ValueError) as error:
+            raise SourceError(f"{path}: splits are not such as TFDS writes ({error}); fetch it again") from error
         for shard in self.shards:
             match = _SHARD.fullmatch(shard)
             if match:
@@ -149,7 +159,17 @@ class RldsSource:
     def read(self, ref: EpisodeRef) -> Episode:
         """Reads one record. Cameras with a placeholder of one colour are left out; ``meta["blank"]`` names them."""
         example = read_record(self.folder, ref)
-        cameras, blank = _cameras(example, self.keys)
+        frames = {
+            name: EncodedFrames(example.blobs(f"steps/{key}"), f"{example.where}: steps/{key}")
+            for name, key in self.keys.cameras.items()
+        }
+        # BridgeData has flags for placeholders (``has_image_0``), but files exist in which all flags are false.
+        blank = [
+            name
+            for name, pictures in frames.items()
+            if len(set(pictures.payloads)) == 1 and not np.ptp(pictures.read([0]), axis=(0, 1, 2)).any()
+        ]
+        cameras = {name: pictures for name, pictures in frames.items() if name not in blank}
         if not cameras:
             raise EpisodeError.at(example.where, f"{', '.join(blank)} hold placeholders of one colour", LEAVE_OUT)
         count = len(next(iter(cameras.values())))
@@ -205,23 +225,6 @@ class RldsSource:
         return ArrayFrames(np.nan_to_num(maps, nan=0, posinf=0, neginf=0))
 
 
-def _cameras(example: Example, keys: KeyMap) -> tuple[dict[str, EncodedFrames], list[str]]:
-    """Returns the cameras by name, and the names of placeholders, whose pictures are all the same and of one colour.
-
-    BridgeData has flags for placeholders (``has_image_0``), but files exist in which all flags are false.
-    """
-    frames = {
-        name: EncodedFrames(example.blobs(f"steps/{key}"), f"{example.where}: steps/{key}")
-        for name, key in keys.cameras.items()
-    }
-    blank = [
-        name
-        for name, pictures in frames.items()
-        if len(set(pictures.payloads)) == 1 and not np.ptp(pictures.read([0]), axis=(0, 1, 2)).any()
-    ]
-    return {name: pictures for name, pictures in frames.items() if name not in blank}, blank
-
-
 def _joined(example: Example, keys: Sequence[str], count: int) -> tuple[Float32[np.ndarray, "N n"], list[str]]:
     """Returns these features side by side, and a name for each dimension."""
     parts = [example.numbers(f"steps/{key}", count) for key in keys]
@@ -250,22 +253,6 @@ def _split_name(shard: Path) -> tuple[str, str]:
     if match:
         return (match["name"], match["split"])
     return (shard.name.partition(".")[0], "")
-
-
-def _expected(folder: Path) -> dict[str, int]:
-    """Returns how many records each shard should have, as far as dataset_info.json says."""
-    counts: dict[str, int] = {}
-    path = folder / "dataset_info.json"
-    info = _read_object(path)
-    try:
-        for split in info.get("splits", []):
-            lengths = split.get("shardLengths", [])
-            for number, length in enumerate(lengths):
-                name = f"{info.get('name')}-{split.get('name')}.tfrecord-{number:05d}-of-{len(lengths):05d}"
-                counts[name] = int(length)
-    except (AttributeError, TypeError, ValueError) as error:
-        raise SourceError(f"{path}: splits are not such as TFDS writes ({error}); fetch it again") from error
-    return counts
 
 
 def _read_object(path: Path) -> dict[str, Any]:
@@ -370,6 +357,16 @@ def propose(path: Path, features: Mapping[str, Feature], fps: float) -> KeyMap:
     observed = [key for key, one in features.items() if key.startswith("observation/") and one.is_row]
     own = [key for key in observed if key == "observation/state"]
     texts = [key for key, one in features.items() if one.kind == "text" and _TEXT.search(key)]
+
+    def bare(name: str) -> str:
+        return "_".join(word for word in name.split("_") if word not in ("depth", "image", "rgb", "color"))
+
+    # A single camera has the only maps; otherwise the names must match without words such as "depth" and "rgb".
+    if len(cameras) == len(maps) == 1:
+        depth = dict(zip(cameras, maps.values(), strict=True))
+    else:
+        by_name = {bare(name): key for name, key in maps.items()}
+        depth = {name: by_name[bare(name)] for name in cameras if bare(name) in by_name}
     return KeyMap(
         cameras=cameras,
         action=tuple(action),
@@ -378,27 +375,12 @@ def propose(path: Path, features: Mapping[str, Feature], fps: float) -> KeyMap:
         task=tuple(sorted(texts, key=len)),
         kind=None,
         held=None,
-        depth=_pairs(cameras, maps),
+        depth=depth,
     )
 
 
 def _name(key: str) -> str:
     return key.removeprefix("observation/").replace("/", "_")
-
-
-def _pairs(cameras: Mapping[str, str], maps: Mapping[str, str]) -> dict[str, str]:
-    """Returns each camera's depth maps.
-
-    A single camera has the only maps; otherwise the names must match without words such as ``depth`` and ``rgb``.
-    """
-
-    def bare(name: str) -> str:
-        return "_".join(word for word in name.split("_") if word not in ("depth", "image", "rgb", "color"))
-
-    if len(cameras) == len(maps) == 1:
-        return dict(zip(cameras, maps.values(), strict=True))
-    by_name = {bare(name): key for name, key in maps.items()}
-    return {name: by_name[bare(name)] for name in cameras if bare(name) in by_name}
 
 
 def check_keys(keys: KeyMap, path: Path, features: Mapping[str, Feature]) -> None:

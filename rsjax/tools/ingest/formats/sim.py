@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from rsjax.clip import UNKNOWN, words_of
 from rsjax.data.store import Record, Store, StoreError, open_store
@@ -102,7 +101,17 @@ class StoreSource:
         provenance = record.get("provenance", {})
         camera = str(provenance.get("camera", "camera"))
         steps = int((self.store.manifest.get("config") or {}).get("control_steps", 1))
-        fps, timestamps = _times(provenance, len(record["rgb"]), steps)
+        count = len(record["rgb"])
+        if "control_hz" in provenance:  # a simulator's clock
+            fps = float(provenance["control_hz"]) / steps
+            timestamps = np.arange(count) / fps
+        elif count > 1 and len(provenance.get("frames", ())) == count:
+            seconds = provenance.get("times") or np.array(provenance["frames"]) / float(provenance["fps"])
+            timestamps = np.asarray(seconds, np.float64) - seconds[0]
+            fps = 1 / max(float(np.median(np.diff(timestamps))), 1e-6)
+        else:
+            fps = FPS
+            timestamps = np.arange(count) / fps
         width = record["actions"].shape[1]
         layout = layout_of(record["actions"], self.kind, self.held, (), (), None)
         if "control_hz" in provenance:  # a simulator's own: the last dimension of each control step is the gripper
@@ -130,19 +139,6 @@ class StoreSource:
                 "success": np.asarray(record.get("success", []), bool).tolist(),
             },
         )
-
-
-def _times(provenance: dict[str, Any], count: int, steps: int) -> tuple[float, Float[np.ndarray, " N"]]:
-    """Returns frames per second and each frame's time, by a simulator's clock or by the times in the recording."""
-    if "control_hz" in provenance:
-        fps = float(provenance["control_hz"]) / steps
-    elif count > 1 and len(provenance.get("frames", ())) == count:
-        seconds = provenance.get("times") or np.array(provenance["frames"]) / float(provenance["fps"])
-        times = np.asarray(seconds, np.float64) - seconds[0]
-        return 1 / max(float(np.median(np.diff(times))), 1e-6), times
-    else:
-        fps = FPS
-    return fps, np.arange(count) / fps
 
 
 def _check_arrays(record: Record, where: str) -> None:
