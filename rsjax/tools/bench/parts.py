@@ -115,12 +115,20 @@ def sample(config: Config, batch: int, budget: float, horizons: tuple[int, ...])
     """
     model = create_model(config)
     key = jax.random.key(0)
+    params = jax.jit(model.init)(key)
+    numbers: Numbers = {}
     if not isinstance(model, RoboScape):
-        return _sample_pixels(config, batch, budget, horizons)
+        assets = inputs.assets(config)
+        numbers["sample_prompt_frames"] = PROMPT_FRAMES
+        for frames in horizons:
+            video = inputs.prompt_video(config, batch, PROMPT_FRAMES)
+            rows = np.random.default_rng(1).normal(size=(batch, frames, config.clips.action_dim)).astype(np.float32)
+            generate = partial(model.generate, params, assets, video, rows)
+            numbers[f"sample_s_per_frame_{frames}"] = median_seconds(generate, budget) / (frames - PROMPT_FRAMES)
+        return numbers | {"sample_s_per_frame": numbers[f"sample_s_per_frame_{horizons[0]}"]}
     arch = model.architecture
     settings = model.config.sample
-    params = jax.jit(model.init)(jax.random.key(0))
-    numbers: Numbers = {"sample_steps": settings.steps, "sample_prompt_frames": PROMPT_FRAMES}
+    numbers |= {"sample_steps": settings.steps, "sample_prompt_frames": PROMPT_FRAMES}
     for frames in horizons:
         actions = inputs.actions(arch, batch, frames)
         late = max(PROMPT_FRAMES, frames - UNCACHED_FRAMES)
@@ -137,19 +145,6 @@ def sample(config: Config, batch: int, budget: float, horizons: tuple[int, ...])
         cost = numbers[f"sample_s_per_frame_cached_{last}"] / numbers["sample_s_per_frame_cached"]
         numbers[f"sample_cost_ratio_{last}_over_{first}"] = cost
     return numbers
-
-
-def _sample_pixels(config: Config, batch: int, budget: float, horizons: tuple[int, ...]) -> Numbers:
-    model = create_model(config)
-    assets = inputs.assets(config)
-    params = jax.jit(model.init)(jax.random.key(0))
-    numbers: Numbers = {"sample_prompt_frames": PROMPT_FRAMES}
-    for frames in horizons:
-        prompt = inputs.prompt_video(config, batch, PROMPT_FRAMES)
-        actions = np.random.default_rng(1).normal(size=(batch, frames, config.clips.action_dim)).astype(np.float32)
-        run = partial(model.generate, params, assets, prompt, actions)
-        numbers[f"sample_s_per_frame_{frames}"] = median_seconds(run, budget) / (frames - PROMPT_FRAMES)
-    return numbers | {"sample_s_per_frame": numbers[f"sample_s_per_frame_{horizons[0]}"]}
 
 
 def tokenizer(config: Config, batch: int, budget: float) -> Numbers:

@@ -164,7 +164,18 @@ def parse(text: str) -> Module:
             start = _INSTRUCTION.match(line)
             if start is None:
                 continue
-            one = _instruction(start[2], line[start.end() :])
+            definition = line[start.end() :]
+            end = definition.index(" ")
+            if definition.startswith("("):
+                end = _closing(definition)
+            shape = definition[:end]
+            opcode, _, rest = definition[end:].strip().partition("(")
+            close = _closing("(" + rest) - 1
+            argument = rest[: close - 1]
+            operands = []
+            if opcode != "constant":
+                operands = re.findall(r"%([^\s,()]+)", _COMMENT.sub("", argument))
+            one = Instruction(start[2], arrays(shape), opcode, argument, tuple(operands), rest[close:])
             current.instructions[one.name] = one
             if start[1]:
                 current.root = one.name
@@ -200,21 +211,6 @@ def arrays(text: str) -> tuple[Array, ...]:
 
 def _numbers(text: str | None) -> tuple[int, ...]:
     return tuple(map(int, re.findall(r"\d+", text or "")))
-
-
-def _instruction(name: str, text: str) -> Instruction:
-    """Parses the part of an instruction's line after ``=``."""
-    end = text.index(" ")
-    if text.startswith("("):
-        end = _closing(text)
-    shape = text[:end]
-    opcode, _, rest = text[end:].strip().partition("(")
-    close = _closing("(" + rest) - 1
-    argument = rest[: close - 1]
-    operands = []
-    if opcode != "constant":
-        operands = re.findall(r"%([^\s,()]+)", _COMMENT.sub("", argument))
-    return Instruction(name, arrays(shape), opcode, argument, tuple(operands), rest[close:])
 
 
 def _closing(text: str) -> int:

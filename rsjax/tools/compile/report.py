@@ -20,7 +20,7 @@ from rsjax.files import write_file
 from rsjax.layers.platform import for_all_platforms
 from rsjax.progress import duration
 from rsjax.tools.compile.programs import Program
-from rsjax.tools.compile.roofline import Kernel, Roofline, part_of, roofline
+from rsjax.tools.compile.roofline import Roofline, part_of, roofline
 from rsjax.tools.compile.targets import Target, answers_for
 
 LAUNCH_SECONDS = 3e-6  # of a kernel on a GPU; 2 to 5 µs
@@ -150,7 +150,23 @@ def figures(program: Program, target: Target, compiled: Compiled) -> dict[str, A
         for name, part in parts.items()
     ]
     top = sorted(cost.kernels, key=lambda kernel: -kernel.launches * (kernel.seconds + kernel.exposed))[:TOP]
-    numbers["operations"] = [_operation(kernel, cost) for kernel in top]
+    operations = []
+    for kernel in top:
+        total = kernel.launches * (kernel.seconds + kernel.exposed)
+        operations.append(
+            {
+                "part": part_of(kernel.op_name, 4),
+                "operation": kernel.op_name.rpartition("/")[2] or kernel.opcode,
+                "kernel": kernel.name,
+                "seconds": total,
+                "share": total / (cost.seconds + cost.exposed),
+                "launches": kernel.launches,
+                "bytes": kernel.bytes,
+                "flops": kernel.flops,
+                "sent": kernel.sent,
+            }
+        )
+    numbers["operations"] = operations
     return numbers
 
 
@@ -169,21 +185,6 @@ def bound_by(cost: Roofline, target: Target) -> dict[str, float]:
     if target.card.platform == "cuda":
         shares["launches"] = cost.launches * LAUNCH_SECONDS / total
     return shares
-
-
-def _operation(kernel: Kernel, cost: Roofline) -> dict[str, Any]:
-    total = kernel.launches * (kernel.seconds + kernel.exposed)
-    return {
-        "part": part_of(kernel.op_name, 4),
-        "operation": kernel.op_name.rpartition("/")[2] or kernel.opcode,
-        "kernel": kernel.name,
-        "seconds": total,
-        "share": total / (cost.seconds + cost.exposed),
-        "launches": kernel.launches,
-        "bytes": kernel.bytes,
-        "flops": kernel.flops,
-        "sent": kernel.sent,
-    }
 
 
 def largest_batch(batches: dict[int, int], room: float, step: int) -> int:

@@ -86,11 +86,21 @@ def read_tensors(path: Path, holders: Sequence[str] = HOLDERS) -> TensorFile:
         raise ConvertError(f"{path}: {what}")
     if instead := placeholder(path):
         raise ConvertError(f"{path}: {instead}")
+    read: Tensors = {}
     metadata: dict[str, str] = {}
     others: dict[str, int] = {}
     key = ""
     if path.suffix == SAFE:
-        read, metadata = _read_safetensors(path)
+        try:
+            with safetensors.safe_open(path, "np") as file:
+                for name in file.keys():  # noqa: SIM118 - it is not a dict
+                    try:
+                        read[name] = file.get_tensor(name)
+                    except (AttributeError, TypeError) as error:  # numpy has no such type
+                        raise _unreadable(path, name, file.get_slice(name).get_dtype()) from error
+                metadata = file.metadata() or {}
+        except (safetensors.SafetensorError, OSError) as error:
+            raise ConvertError(f"{path}: not a safetensors file, or damaged ({first_line(error)})") from error
     elif path.suffix in PICKLED:
         read, others, key = _read_torch(path, holders)
     else:
@@ -158,20 +168,6 @@ def exported_config(kind: type[T], source: Path, metadata: dict[str, str], key: 
         return from_dict(kind, parse_json(metadata[key]))
     except (ValueError, TypeError, ConfigError) as error:
         raise ConvertError(f"{source}: its metadata {key} are of another version or damaged ({error})") from error
-
-
-def _read_safetensors(path: Path) -> tuple[Tensors, dict[str, str]]:
-    tensors: Tensors = {}
-    try:
-        with safetensors.safe_open(path, "np") as file:
-            for name in file.keys():  # noqa: SIM118 - it is not a dict
-                try:
-                    tensors[name] = file.get_tensor(name)
-                except (AttributeError, TypeError) as error:  # numpy has no such type
-                    raise _unreadable(path, name, file.get_slice(name).get_dtype()) from error
-            return tensors, file.metadata() or {}
-    except (safetensors.SafetensorError, OSError) as error:
-        raise ConvertError(f"{path}: not a safetensors file, or damaged ({first_line(error)})") from error
 
 
 class _Placeholder:

@@ -153,12 +153,15 @@ def check(source: object, tensors: Tensors, expected: dict[str, Shape], names: N
             reports them all.
     """
     both = {key: (names.get(key, key), tensors[key], shape) for key, shape in expected.items() if key in tensors}
+    floats = [(n, x) for n, x, _ in both.values() if _is_float(x)]
+    with np.errstate(over="ignore"):
+        not_finite = [n for n, x in floats if not np.isfinite(x.astype(np.float32)).all()]
     misfits: dict[str, Collection[str]] = {
         "missing": [names.get(key, key) for key in expected.keys() - tensors.keys()],
         "unexpected": [names.get(key, key) for key in tensors.keys() - expected.keys()],
         "of another shape": [f"{n} is {x.shape}, not {shape}" for n, x, shape in both.values() if x.shape != shape],
         "not floats": [f"{n} is {x.dtype}" for n, x, _ in both.values() if not _is_float(x)],
-        "with NaN or infinite values": [n for n, x, _ in both.values() if _is_float(x) and not _is_finite(x)],
+        "with NaN or infinite values": not_finite,
     }
     listed = "; ".join(f"{kind}: {_some(found)}" for kind, found in misfits.items() if found)
     if listed:
@@ -167,11 +170,6 @@ def check(source: object, tensors: Tensors, expected: dict[str, Shape], names: N
 
 def _is_float(x: np.ndarray) -> bool:
     return bool(dtypes.issubdtype(x.dtype, np.floating))  # bfloat16 included
-
-
-def _is_finite(x: np.ndarray) -> bool:
-    with np.errstate(over="ignore"):
-        return bool(np.isfinite(x.astype(np.float32)).all())
 
 
 def _some(names: Iterable[str]) -> str:
