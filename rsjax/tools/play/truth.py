@@ -94,7 +94,27 @@ class Follower:
     def _follow(self, nodes: list[Node]) -> list[int]:
         try:
             self._helper = self._helper or Helper(self._make)
-            return self._filled(self._helper, nodes)
+            done = len(self._applied)
+            if not done or len(nodes) < done or any(a is not b for a, b in zip(self._applied, nodes, strict=False)):
+                done = 0
+                self._applied = []
+            filled = []
+            for number in range(done, len(nodes)):
+                node = nodes[number]
+                if number == 0:
+                    seed = self._seed
+                else:
+                    seed = None
+                made = self._helper(Job(self._task, seed, node.action, node.truth is None), SECONDS)
+                self._applied.append(node)
+                if made is not None:
+                    squared = np.mean((made.rgb.astype(np.float64) - node.state.rgb) ** 2)
+                    psnr = None  # of equal pictures
+                    if squared != 0:
+                        psnr = round(float(10 * np.log10(PEAK**2 / squared)), 3)
+                    node.truth = Truth(made.rgb, made.depth, made.success, psnr)
+                    filled.append(number)
+            return filled
         except WorkerDied as error:
             self._helper = None
             self._applied = []
@@ -102,26 +122,3 @@ class Follower:
         except Exception as error:  # from the simulator; the action may have been taken
             self._applied = []
             raise Refused("no_truth", first_line(error)) from error
-
-    def _filled(self, helper: Helper[Job, Rendered | None], nodes: list[Node]) -> list[int]:
-        done = len(self._applied)
-        if not done or len(nodes) < done or any(a is not b for a, b in zip(self._applied, nodes, strict=False)):
-            done = 0
-            self._applied = []
-        filled = []
-        for number in range(done, len(nodes)):
-            node = nodes[number]
-            if number == 0:
-                seed = self._seed
-            else:
-                seed = None
-            made = helper(Job(self._task, seed, node.action, node.truth is None), SECONDS)
-            self._applied.append(node)
-            if made is not None:
-                error = np.mean((made.rgb.astype(np.float64) - node.state.rgb) ** 2)
-                psnr = None  # of equal pictures
-                if error != 0:
-                    psnr = round(float(10 * np.log10(PEAK**2 / error)), 3)
-                node.truth = Truth(made.rgb, made.depth, made.success, psnr)
-                filled.append(number)
-        return filled

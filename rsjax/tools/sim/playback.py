@@ -61,35 +61,27 @@ def local_model(text: str) -> str:
         if element.tag in _REFUSED:
             raise PlaybackError(f"the model has an element {element.tag!r}, which loads other files")
         if element.tag in ("texture", "hfield"):
-            _check_size(element)
+            for pair in (("width", "height"), ("ncol", "nrow")):
+                try:
+                    first, second = (int(element.get(name, "1")) for name in pair)
+                except ValueError as error:
+                    raise PlaybackError(f"the model has a {element.tag} of a size that is no number") from error
+                if not 0 < first * second <= _MOST_PIXELS:
+                    raise PlaybackError(f"the model has a {element.tag} of {first} × {second}")
         for name in _FOLDERS if element.tag == "compiler" else ():
             element.attrib.pop(name, None)
         if element.tag == "size":
             element.attrib.pop("memory", None)
         for name, value in element.attrib.items():
             if name.startswith("file"):
-                element.set(name, str(_local_file(value, assets)))
+                _, found, inner = value.replace("\\", "/").rpartition("/models/assets/")
+                path = (assets / inner).resolve()
+                if not found or not path.is_relative_to(assets) or not path.is_file():
+                    raise PlaybackError(
+                        f"the model names the file {value!r:.200}, which the installed robosuite does not have"
+                    )
+                element.set(name, str(path))
     return ElementTree.tostring(root, encoding="unicode")
-
-
-def _local_file(name: str, assets: Path) -> Path:
-    """Returns the installed file that corresponds to a path of another machine's robosuite."""
-    _, found, inner = name.replace("\\", "/").rpartition("/models/assets/")
-    path = (assets / inner).resolve()
-    if not found or not path.is_relative_to(assets) or not path.is_file():
-        raise PlaybackError(f"the model names the file {name!r:.200}, which the installed robosuite does not have")
-    return path
-
-
-def _check_size(element: ElementTree.Element) -> None:
-    sides = [("width", "height"), ("ncol", "nrow")]
-    for pair in sides:
-        try:
-            first, second = (int(element.get(name, "1")) for name in pair)
-        except ValueError as error:
-            raise PlaybackError(f"the model has a {element.tag} of a size that is no number") from error
-        if not 0 < first * second <= _MOST_PIXELS:
-            raise PlaybackError(f"the model has a {element.tag} of {first} × {second}")
 
 
 class Playback:

@@ -36,7 +36,12 @@ def collect_second_takes(
         UserError: the clips were not simulated, the simulator fails on one, or a take starts differently from its clip;
             also the errors of :func:`rsjax.tools.sim.collect.collect`.
     """
-    config = _config(clips)
+    saved = clips.manifest.get("config")
+    config = None
+    if isinstance(saved, dict) and "control_steps" in saved and "episodes" in saved:
+        config = from_dict(SimConfig, saved)
+    if config is None or source_name(config) != clips.manifest.get("source"):
+        raise UserError(f"{clips.path}: these clips were not simulated, so there is no second take of them")
     records = [clips.source(split)[number] for number in numbers]
     plans = tuple(_plan(config, f"{split}-{place:06d}", record) for place, record in enumerate(records))
     key = content_key("second takes", RECIPE, str(clips.manifest.get("key")), split, tuple(map(int, numbers)), JITTER)
@@ -69,17 +74,6 @@ def _identity(record: Record) -> tuple[int, str]:
     """Returns what tells a clip from the others of its split; paired clips have one episode's number."""
     origin = record["provenance"]
     return origin["episode"], str(origin["expert"])
-
-
-def _config(clips: Store) -> SimConfig:
-    """Returns the configuration that simulated a store's clips."""
-    manifest = clips.manifest
-    config = manifest.get("config")
-    if isinstance(config, dict) and "control_steps" in config and "episodes" in config:
-        found = from_dict(SimConfig, config)
-        if source_name(found) == manifest.get("source"):
-            return found
-    raise UserError(f"{clips.path}: these clips were not simulated, so there is no second take of them")
 
 
 def _plan(config: SimConfig, name: str, record: Record) -> EpisodePlan:

@@ -7,7 +7,6 @@ Axes: B videos, F frames of a history, H×W pixels.
 """
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -121,7 +120,19 @@ def load_judge(folder: Path, side: int | None = None) -> TrainedJudge:
         temperature = float(record.pop("temperature"))
         trained_on = int(record.pop("side"))
         in_a_row = int(record.pop("in_a_row", 1))
-        _check_judge(record, temperature, trained_on, in_a_row)
+        if not 0 < temperature < math.inf:
+            raise ValueError(f"its temperature is {temperature}, not a number above 0")
+        for name, number in (("side", trained_on), ("in_a_row", in_a_row)):
+            if not 0 < number <= MOST_SIDE:
+                raise ValueError(f"its {name} is {number}, not from 1 to {MOST_SIDE}")
+        frames = jax.ShapeDtypeStruct((1, HISTORY, trained_on, trained_on, 3), np.uint8)
+        shapes = jax.eval_shape(Network().init, jax.random.key(0), frames)["params"]
+        wanted = {"/".join(names): x.shape for names, x in flatten_dict(shapes).items()}
+        present = {name: np.shape(x) for name, x in record.items()}
+        differing = sorted(name for name in present.keys() | wanted.keys() if present.get(name) != wanted.get(name))
+        if differing:
+            first = differing[0]
+            raise ValueError(f"{first} is {present.get(first, 'missing')}, not {wanted.get(first, 'there')}")
     except FileNotFoundError as error:
         raise UserError(f"{path}: no judge there; train one with rsjax judge RUN") from error
     except (OSError, ValueError, KeyError, TypeError, OverflowError) as error:
@@ -141,23 +152,6 @@ def load_judge(folder: Path, side: int | None = None) -> TrainedJudge:
     if found and found.get("judge", judge.key) == judge.key:
         return replace(judge, validation=found)
     return judge
-
-
-def _check_judge(record: Mapping[str, Any], temperature: float, side: int, in_a_row: int) -> None:
-    """Raises ValueError unless a judge can have these parameters and numbers."""
-    if not 0 < temperature < math.inf:
-        raise ValueError(f"its temperature is {temperature}, not a number above 0")
-    if not 0 < side <= MOST_SIDE:
-        raise ValueError(f"its side is {side}, not from 1 to {MOST_SIDE}")
-    if not 0 < in_a_row <= MOST_SIDE:
-        raise ValueError(f"its in_a_row is {in_a_row}, not from 1 to {MOST_SIDE}")
-    frames = jax.ShapeDtypeStruct((1, HISTORY, side, side, 3), np.uint8)
-    params = jax.eval_shape(Network().init, jax.random.key(0), frames)["params"]
-    wanted = {"/".join(path): x.shape for path, x in flatten_dict(params).items()}
-    found = {name: np.shape(x) for name, x in record.items()}
-    if found != wanted:
-        names = sorted(name for name in found.keys() | wanted.keys() if found.get(name) != wanted.get(name))
-        raise ValueError(f"{names[0]} is {found.get(names[0], 'missing')}, not {wanted.get(names[0], 'there')}")
 
 
 def _check_validation(path: Path, validation: dict[str, Any]) -> None:

@@ -116,7 +116,13 @@ def search(
             some = proposals[: len(drawn) - 2]
             drawn[2 : 2 + len(some)] = some
         drawn = np.clip(drawn, low, high)
-        energies = _checked(energy(frames, drawn.astype(np.float32)), len(drawn))
+        energies = np.asarray(energy(frames, drawn.astype(np.float32)), np.float64)
+        wrong = np.isnan(energies) | (energies == -np.inf)
+        if energies.shape != (len(drawn),) or wrong.any():
+            raise UserError(
+                f"the energy of {len(drawn)} candidates has shape {energies.shape}, {wrong.sum()} of it NaN or -inf; "
+                f"expected ({len(drawn)},), numbers"
+            )
         first = int(energies.argmin())
         if energies[first] < lowest:
             best = drawn[first]
@@ -209,14 +215,3 @@ def _noise(config: PlannerConfig, width: int, rng: np.random.Generator) -> Float
         fresh = np.sqrt(1 - config.memory**2) * noise[:, step]
         noise[:, step] = config.memory * noise[:, step - 1] + fresh
     return noise
-
-
-def _checked(energies: Any, count: int) -> Float[np.ndarray, " N"]:
-    found = np.asarray(energies, np.float64)
-    wrong = np.isnan(found) | (found == -np.inf)
-    if found.shape != (count,) or wrong.any():
-        raise UserError(
-            f"the energy of {count} candidates has shape {found.shape}, {wrong.sum()} of it NaN or -inf; "
-            f"expected ({count},), numbers"
-        )
-    return found

@@ -122,19 +122,12 @@ def improve(
         about = {"settings": asdict(settings), "trials": asdict(trials), "judge": summary(model.validation)}
         results = about | {"before": before.success, "clipped": before.clipped, "rounds": rows}
         results["differences"] = differences(results)
-        _write(out, results)
+        write_json(out / "results.json", results)
+        write_file(out / "results.md", table(results).encode())
+        begin = (0.0, _share(before.success))
+        series = {arm: [begin, *[(float(each["round"]), _share(each[arm])) for each in rows]] for arm in arms}
+        write_file(out / "success.png", success_curves(series, "rounds"))
     return results
-
-
-def _write(out: Path, results: dict[str, Any]) -> None:
-    write_json(out / "results.json", results)
-    write_file(out / "results.md", table(results).encode())
-    begin = (0.0, _share(results["before"]))
-    series = {
-        arm: [begin, *[(float(row["round"]), _share(row[arm])) for row in results["rounds"]]]
-        for arm in ("imagined", "control")
-    }
-    write_file(out / "success.png", success_curves(series, "rounds"))
 
 
 def imagine(

@@ -275,26 +275,21 @@ def write_results(out: Path, rows: Sequence[dict[str, Any]], trials: Trials) -> 
         sides = [[each[world] for each in row["policies"].values()] for world in ("simulator", "world_model")]
         true, imagined = [[wilson(sum(one), len(one)) for one in side] for side in sides]
         points[row["run"]] = (true, imagined)
-        titles[row["run"]] = _title(row)
+        titles[row["run"]] = ""
+        if "pearson" in row:  # there are enough policies
+            r, bounds = r_text(row["pearson"])
+            correlation = f"r = {r}"
+            if r == ABSENT:
+                correlation = bounds
+            elif bounds:
+                correlation = f"r = {r} [{bounds}]"
+            titles[row["run"]] = f"{correlation}, MMRV {row['mmrv']:.2f}, bias {row['bias']:+.2f}"
     write_file(out / "scatter.png", scatter(points, titles))
 
 
 def results_of(rows: Sequence[dict[str, Any]], trials: Trials) -> dict[str, Any]:
     """Returns the content of ``results.json``."""
     return {"trials": asdict(trials), "runs": list(rows), "trainings": trainings(rows)}
-
-
-def _title(row: Mapping[str, Any]) -> str:
-    """Returns the title of a run's chart: r with its interval, MMRV and bias, if there are enough policies."""
-    if "pearson" not in row:
-        return ""
-    r, bounds = r_text(row["pearson"])
-    correlation = f"r = {r}"
-    if r == ABSENT:
-        correlation = bounds
-    elif bounds:
-        correlation = f"r = {r} [{bounds}]"
-    return f"{correlation}, MMRV {row['mmrv']:.2f}, bias {row['bias']:+.2f}"
 
 
 def r_text(r: Mapping[str, float | None]) -> tuple[str, str]:

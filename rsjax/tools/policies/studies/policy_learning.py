@@ -109,7 +109,18 @@ def learn(
         results: dict[str, Any] = {"trials": asdict(trials), "rows": rows, "claims": claims(rows, max(settings.counts))}
         write_json(out / "results.json", results)
         write_file(out / "results.md", table(rows, results["claims"]).encode())
-        write_file(out / "success.png", success_curves(_series(rows)))
+        series: dict[str, list[tuple[float, Estimate]]] = {}
+        for row in rows:
+            if row["real"] and row["synthetic"]:
+                kind = "both"
+            elif row["steps"] > 1:
+                kind = "repeated"
+            elif row["real"]:
+                kind = "real"
+            else:
+                kind = "synthetic"
+            series.setdefault(kind, []).append((row["real"] + row["synthetic"], pooled(row)))
+        write_file(out / "success.png", success_curves(series))
     return results
 
 
@@ -178,17 +189,3 @@ def interval_text(share: Estimate) -> str:
     if share.low is None or share.high is None:
         return ""
     return f"{100 * share.low:.0f} … {100 * share.high:.0f} %"
-
-
-def _series(rows: Sequence[dict[str, Any]]) -> dict[str, list[tuple[float, Estimate]]]:
-    series: dict[str, list[tuple[float, Estimate]]] = {}
-    for row in rows:
-        if row["real"] and row["synthetic"]:
-            kind = "both"
-        elif row["steps"] > 1:
-            kind = "repeated"
-        else:
-            kind = ""
-        kind = kind or ("real" if row["real"] else "synthetic")
-        series.setdefault(kind, []).append((row["real"] + row["synthetic"], pooled(row)))
-    return series

@@ -111,7 +111,19 @@ def synthesize(
             place = out / f"lerobot-{version}"
             shutil.rmtree(place, ignore_errors=True)  # left by an attempt that did not finish
             export_lerobot(clips, place, LeRobotOptions(version))
-        content = {"key": key, **asdict(options), **_summary(clips, judge)}
+        made = [clip for _, clip in readable(clips.source("train"))]
+        origins = [clip["provenance"] for clip in made]
+        content = {
+            "key": key,
+            **asdict(options),
+            "clipped": sum(origin["clipped"] for origin in origins),
+            "success": None if judge is None else sum(bool(clip["success"][-1]) for clip in made),
+            "uninterpretable": None if judge is None else sum(origin["uninterpretable"] for origin in origins),
+            "judge": summary(getattr(judge, "validation", None)),
+            "sources": len({str(origin["from"]["episode"]) for origin in origins}),
+            "from": origins[0]["from"]["key"],
+            "manifest": str(clips.path / MANIFEST),
+        }
         write_json(out / SUMMARY, content)
     return content
 
@@ -259,17 +271,3 @@ def labels(rgb: UInt8[np.ndarray, "B T S S 3"], judge: Judge) -> Int[np.ndarray,
 
 def _file(folder: Path, number: int) -> Path:
     return folder / f"{number:06d}.clip"
-
-
-def _summary(clips: Store, judge: Judge | None) -> dict[str, Any]:
-    made = [clip for _, clip in readable(clips.source("train"))]
-    origins = [clip["provenance"] for clip in made]
-    return {
-        "clipped": sum(origin["clipped"] for origin in origins),
-        "success": None if judge is None else sum(bool(clip["success"][-1]) for clip in made),
-        "uninterpretable": None if judge is None else sum(origin["uninterpretable"] for origin in origins),
-        "judge": summary(getattr(judge, "validation", None)),
-        "sources": len({str(origin["from"]["episode"]) for origin in origins}),
-        "from": origins[0]["from"]["key"],
-        "manifest": str(clips.path / MANIFEST),
-    }

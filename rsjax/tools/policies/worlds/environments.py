@@ -370,7 +370,21 @@ class WorldModelVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
             StartError: the given frame does not fit, or the run's clips are missing.
         """
         if seed is not None or not self._rng:
-            self._rng = [np.random.default_rng(each) for each in _seeds(seed, self.num_envs)]
+            count = self.num_envs
+            seeds: list[int | None]
+            if seed is None:
+                seeds = [None] * count
+            elif not isinstance(seed, Sequence | np.ndarray) or isinstance(seed, str) or getattr(seed, "ndim", 1) != 1:
+                first = checked_seed(seed)
+                assert first is not None
+                seeds = [first + number for number in range(count)]
+            else:
+                seeds = [checked_seed(each) for each in seed]
+            if len(seeds) != count:
+                raise UserError(
+                    f"{len(seeds)} seeds for {count} environments; give one number, or one for each environment"
+                )
+            self._rng = [np.random.default_rng(each) for each in seeds]
         everything = np.ones(self.num_envs, bool)
         state = self._model.world.reset(self._begin(everything, {} if options is None else options))
         self._over[:] = False
@@ -414,20 +428,6 @@ class WorldModelVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         self._clipped[which] = 0
         self._clip[which] = [start.clip for start in starts]
         return starts
-
-
-def _seeds(seed: int | Sequence[int | None] | None, count: int) -> list[int | None]:
-    """Returns the seed of each environment."""
-    if seed is None:
-        return [None] * count
-    if not isinstance(seed, Sequence | np.ndarray) or isinstance(seed, str) or getattr(seed, "ndim", 1) != 1:
-        first = checked_seed(seed)
-        assert first is not None
-        return [first + number for number in range(count)]
-    seeds = [checked_seed(each) for each in seed]
-    if len(seeds) != count:
-        raise UserError(f"{len(seeds)} seeds for {count} environments; give one number, or one for each environment")
-    return seeds
 
 
 def _masked(info: dict[str, np.ndarray]) -> dict[str, Any]:

@@ -135,21 +135,22 @@ def run_episodes(world: World, act: Actor, starts: Sequence[Any], steps: int) ->
         states.append(state)
         ends[state.success & ~over] = step
         over = over | state.success
-    return [_episode(states[: end + 1], number) for number, end in enumerate(ends.tolist())]
-
-
-def _episode(states: Sequence[WorldState], number: int) -> Episode:
-    success = np.array([state.success[number] for state in states])
-    success[0] = False  # the policy has done nothing yet, whatever a judge says of the first frame
-    depth = None
-    if "depth" in states[0].observation:
-        depth = np.stack([state.observation["depth"][number] for state in states])
-    verdict = states[-1].verdict
-    return Episode(
-        rgb=np.stack([state.observation["rgb"][number] for state in states]),
-        depth=depth,
-        actions=np.stack([state.actions[number] for state in states]),
-        success=success,
-        clipped=int(sum(state.clipped[number] for state in states)),
-        uninterpretable=verdict is not None and int(verdict[number].argmax()) == UNINTERPRETABLE,
-    )
+    episodes = []
+    for number, end in enumerate(ends.tolist()):
+        own = states[: end + 1]
+        success = np.array([state.success[number] for state in own])
+        success[0] = False  # the policy has done nothing yet, whatever a judge says of the first frame
+        depth = None
+        if "depth" in own[0].observation:
+            depth = np.stack([state.observation["depth"][number] for state in own])
+        verdict = own[-1].verdict
+        episode = Episode(
+            rgb=np.stack([state.observation["rgb"][number] for state in own]),
+            depth=depth,
+            actions=np.stack([state.actions[number] for state in own]),
+            success=success,
+            clipped=int(sum(state.clipped[number] for state in own)),
+            uninterpretable=verdict is not None and int(verdict[number].argmax()) == UNINTERPRETABLE,
+        )
+        episodes.append(episode)
+    return episodes
