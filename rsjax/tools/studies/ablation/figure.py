@@ -5,7 +5,6 @@ import textwrap
 from collections.abc import Mapping, Sequence
 from typing import Protocol
 
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
@@ -53,7 +52,23 @@ def draw(rows: Sequence[Line], columns: Sequence[Metric], title: str, source: st
     if columns:
         panels = figure.subplots(1, len(columns), sharey=True, squeeze=False)[0]
         for axes, column in zip(panels, columns, strict=True):
-            _panel(axes, column, shown, best(rows, column))
+            top = best(rows, column)
+            for y, row in enumerate(shown):
+                if column.name not in row.spreads:
+                    place = axes.get_yaxis_transform()
+                    axes.text(0.5, y, ABSENT, transform=place, ha="center", va="center", color=FAINT)
+                    continue
+                mean, std, _ = row.spreads[column.name]
+                color = BEST if y in top else PLAIN
+                seeds = row.by_seed(column.name)
+                axes.scatter(seeds, [y + 0.25] * len(seeds), s=16, facecolors="none", edgecolors=color, linewidths=0.9)
+                axes.errorbar(mean, y, xerr=std, fmt="D", markersize=5, color=color, capsize=3, linewidth=1.4)
+            axes.set_title(textwrap.fill(column.heading, 26), fontsize=10, loc="left")
+            axes.grid(axis="x", alpha=0.25)
+            axes.xaxis.set_major_locator(MaxNLocator(3))
+            axes.tick_params(axis="x", labelsize=8)
+            axes.tick_params(axis="y", labelsize=9, length=0)
+            axes.spines[["top", "right", "left"]].set_visible(False)
         panels[0].set_yticks(range(len(shown)), [row.label for row in shown])
         panels[0].set_ylim(len(shown) - 0.5, -0.5)
     else:
@@ -61,21 +76,3 @@ def draw(rows: Sequence[Line], columns: Sequence[Metric], title: str, source: st
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=110, metadata={"Source": source} if source else None)
     return buffer.getvalue()
-
-
-def _panel(axes: Axes, column: Metric, rows: Sequence[Line], top: set[int]) -> None:
-    for y, row in enumerate(rows):
-        if column.name not in row.spreads:
-            axes.text(0.5, y, ABSENT, transform=axes.get_yaxis_transform(), ha="center", va="center", color=FAINT)
-            continue
-        mean, std, _ = row.spreads[column.name]
-        color = BEST if y in top else PLAIN
-        seeds = row.by_seed(column.name)
-        axes.scatter(seeds, [y + 0.25] * len(seeds), s=16, facecolors="none", edgecolors=color, linewidths=0.9)
-        axes.errorbar(mean, y, xerr=std, fmt="D", markersize=5, color=color, capsize=3, linewidth=1.4)
-    axes.set_title(textwrap.fill(column.heading, 26), fontsize=10, loc="left")
-    axes.grid(axis="x", alpha=0.25)
-    axes.xaxis.set_major_locator(MaxNLocator(3))
-    axes.tick_params(axis="x", labelsize=8)
-    axes.tick_params(axis="y", labelsize=9, length=0)
-    axes.spines[["top", "right", "left"]].set_visible(False)

@@ -97,8 +97,22 @@ def read_groups(texts: Sequence[str], label: str | None) -> list[Group]:
         label = chosen[0]
     groups = []
     for name, paths in named:
-        folders = tuple(_folder(run, label) for run in paths)
-        groups.append(Group(name, tuple(map(read_result, folders)), folders))
+        folders = []
+        for run in paths:
+            results = results_of(run)
+            if label not in results:
+                parts = [each for each in results if each.startswith(f"{label},")]
+                if parts:
+                    raise UserError(
+                        f"{run}: no result {label}, but {' and '.join(parts)}; choose one of them with --protocol"
+                    )
+                has = f"it has {', '.join(results)}" if results else "it has none"
+                raise UserError(
+                    f"{run}: no result of protocol {label}{did_you_mean(label, results)} ({has}); "
+                    f"rsjax evaluate {run} --protocol {label.partition(',')[0]}"
+                )
+            folders.append(results[label])
+        groups.append(Group(name, tuple(map(read_result, folders)), tuple(folders)))
     for group in groups:
         check_seeds(group)
     check_alike(groups)
@@ -109,19 +123,6 @@ def results_of(run: Path) -> dict[str, Path]:
     """Returns the folders of a run's results by label; "run" is the label of its evaluation stage."""
     own = {OWN: run / "evaluation"} if (run / "evaluation" / NAME).exists() else {}
     return own | {path.parent.name: path.parent for path in sorted((run / FOLDER).glob(f"*/{NAME}"))}
-
-
-def _folder(run: Path, label: str) -> Path:
-    found = results_of(run)
-    if parts := [each for each in found if each.startswith(f"{label},")] if label not in found else []:
-        raise UserError(f"{run}: no result {label}, but {' and '.join(parts)}; choose one of them with --protocol")
-    if label not in found:
-        has = f"it has {', '.join(found)}" if found else "it has none"
-        raise UserError(
-            f"{run}: no result of protocol {label}{did_you_mean(label, found)} ({has}); "
-            f"rsjax evaluate {run} --protocol {label.partition(',')[0]}"
-        )
-    return found[label]
 
 
 def check_alike(groups: Sequence[Group]) -> None:

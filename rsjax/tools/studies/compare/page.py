@@ -1,7 +1,6 @@
 """Writes a comparison as one self-contained HTML page: tables, curves over frames, film strips of the same clips."""
 
 import textwrap
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce
 from pathlib import Path
@@ -55,7 +54,21 @@ def write_page(path: Path, comparison: Comparison, command: str) -> None:
     shown = strips(comparison)
     charts = [_chart(comparison, metric) for metric in comparison.metrics if _lines(comparison, metric)]
     if charts and all(contact.AXIS in result.curves for group in comparison.groups for result in group.results):
-        charts.append(_offset_chart(comparison))
+
+        def draw_offsets(axes: Axes) -> None:
+            of_simulator = comparison.groups[0].results[0].curves
+            offsets = np.array(of_simulator[contact.AXIS], float)
+            truth = np.array(of_simulator[contact.SIMULATOR], float)
+            axes.plot(offsets, truth, ":", color=INK, linewidth=1.3, label="simulator")
+            axes.legend(fontsize=8, frameon=False)
+            for number, group in enumerate(comparison.groups):
+                shares = [np.array(result.curves[contact.MODEL], float) for result in group.results]
+                axes.plot(offsets, np.mean(shares, axis=0), color=COLORS[number % len(COLORS)], linewidth=1.3)
+            axes.set_ylim(-0.02, 1.02)
+            axes.set_title("share of grasps that succeed", fontsize=9, loc="left")
+            axes.set_xlabel("offset of the fingers from the cube, cm", fontsize=8)
+
+        charts.append(draw_offsets)
     curves = charts_svg(charts, "scores frame by frame", legend=True, height=2.3) if charts else ""
     html = (
         template_environment("rsjax.tools.studies.compare")
@@ -94,7 +107,15 @@ def strips(comparison: Comparison) -> list[ComparedClip]:
         truth = here[0]["truth"]
         others = [(_label(g.name), frames["prediction"]) for g, frames in zip(comparison.groups, here, strict=True)]
         others.append(("first frame\nrepeated", np.repeat(truth[prompt - 1 : prompt], len(truth), axis=0)))
-        others += _reconstructions(comparison, here)
+        reconstructions: list[tuple[str, np.ndarray]] = []  # each distinct one once
+        for group, frames in zip(comparison.groups, here, strict=True):
+            if "reconstruction" in frames:
+                video = frames["reconstruction"]
+                if not any(np.array_equal(video, other) for _, other in reconstructions):
+                    reconstructions.append((_label(f"tokenizer, {group.name}"), video))
+        if len(reconstructions) == 1:
+            reconstructions = [("tokenizer's\nreconstruction", reconstructions[0][1])]
+        others += reconstructions
         title = f"clip {clips[row]['number']}, {why}"
         out.append(ComparedClip(title, truth, None, prompt_frames=prompt, others=tuple(others)))
     return out
@@ -128,17 +149,6 @@ def _chosen(comparison: Comparison, rows: Int[np.ndarray, " n"]) -> dict[int, st
     return chosen
 
 
-def _reconstructions(comparison: Comparison, kept: Sequence[dict[str, np.ndarray]]) -> list[tuple[str, np.ndarray]]:
-    """Returns the reconstructions by the groups' tokenizers, each distinct one once."""
-    found: list[tuple[str, np.ndarray]] = []
-    for group, frames in zip(comparison.groups, kept, strict=True):
-        if "reconstruction" in frames:
-            video = frames["reconstruction"]
-            if not any(np.array_equal(video, other) for _, other in found):
-                found.append((_label(f"tokenizer, {group.name}"), video))
-    return found if len(found) != 1 else [("tokenizer's\nreconstruction", found[0][1])]
-
-
 def _label(name: str) -> str:
     return "\n".join(textwrap.wrap(name, LABEL, max_lines=2, placeholder="…"))
 
@@ -152,25 +162,6 @@ def _lines(comparison: Comparison, metric: Metric) -> list[tuple[str, np.ndarray
             points = np.mean([np.array(each[name], float) for each in curves], axis=0)
             lines.append((entry.name, np.array(curves[0][metric.axis], float), points))
     return lines
-
-
-def _offset_chart(comparison: Comparison) -> Chart:
-    """Draws the share of grasps that succeed over their offset: in the simulator, and in each group's model."""
-
-    def draw(axes: Axes) -> None:
-        curves = comparison.groups[0].results[0].curves
-        offsets = np.array(curves[contact.AXIS], float)
-        truth = np.array(curves[contact.SIMULATOR], float)
-        axes.plot(offsets, truth, ":", color=INK, linewidth=1.3, label="simulator")
-        axes.legend(fontsize=8, frameon=False)
-        for number, group in enumerate(comparison.groups):
-            shares = [np.array(result.curves[contact.MODEL], float) for result in group.results]
-            axes.plot(offsets, np.mean(shares, axis=0), color=COLORS[number % len(COLORS)], linewidth=1.3)
-        axes.set_ylim(-0.02, 1.02)
-        axes.set_title("share of grasps that succeed", fontsize=9, loc="left")
-        axes.set_xlabel("offset of the fingers from the cube, cm", fontsize=8)
-
-    return draw
 
 
 def _chart(comparison: Comparison, metric: Metric) -> Chart:

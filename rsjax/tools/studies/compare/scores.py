@@ -4,7 +4,7 @@ Axes: S seeds, B clips.
 """
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from typing import Any, Literal
@@ -121,7 +121,19 @@ def columns(groups: Sequence[Group], only: Sequence[str] = ()) -> list[Metric]:
     found = [
         replace(each, column=each.column or each.name in depth) for each in metrics().values() if each.name in names
     ]
-    found += _parts(names)
+    # Parts of metrics, such as ``delta_psnr_t4``; only those of the best of samples are table columns.
+    for name in names:
+        base = base_of(name)
+        part = name.removeprefix(base)
+        whole = name.rpartition("_")[0]
+        bound = part.endswith(("_low", "_high")) and whole in names
+        if base and part and not bound and not part.startswith(tuple(BASELINES)):
+            best = part.endswith(BEST)
+            words = part[1:].replace("_", " ")
+            if best:
+                words = f"best of {part.removeprefix('_best').removesuffix(BEST)}, prompt included"
+            metric = metrics()[base]
+            found.append(replace(metric, name=name, title=f"{metric.title}, {words}", column=best))
     if not only:
         other_depth = {each.name for each in found if each.name.startswith("depth_")} - depth
         return [each for each in found if each.column and each.name not in other_depth]
@@ -144,24 +156,6 @@ def depth_suffix(protocol: Mapping[str, Any]) -> str:
 def base_of(score: str) -> str:
     """Returns the registered metric that a score belongs to: the longest name that the score's begins with, or ""."""
     return max((name for name in metrics() if f"{score}_".startswith(f"{name}_")), key=len, default="")
-
-
-def _parts(names: Collection[str]) -> list[Metric]:
-    """Returns metrics for scores such as ``delta_psnr_t4``; only those of the best of samples are table columns."""
-    found = []
-    for name in names:
-        base = base_of(name)
-        part = name.removeprefix(base)
-        whole = name.rpartition("_")[0]
-        bound = part.endswith(("_low", "_high")) and whole in names
-        if base and part and not bound and not part.startswith(tuple(BASELINES)):
-            best = part.endswith(BEST)
-            words = part[1:].replace("_", " ")
-            if best:
-                words = f"best of {part.removeprefix('_best').removesuffix(BEST)}, prompt included"
-            metric = metrics()[base]
-            found.append(replace(metric, name=name, title=f"{metric.title}, {words}", column=best))
-    return found
 
 
 def score_of(entry: Entry, metric: Metric) -> Score:

@@ -99,14 +99,30 @@ def read_arm(claim: Claim, name: str, plan: Plan, known: Mapping[str, RunResult]
     results = tuple(known[cell.name] for cell in cells)
     finished = [result for result in results if result.state == "finished"]
     keys = [result.run.keys() for result in finished]
+    # Scores over all clips: of the claim's metrics, of baselines, and those shown beside them.
+    compared = dict.fromkeys([*(each.metric for each in claim.comparisons), *claim.shown])
+    baselines = [f"{metric}{suffix}" for metric in compared for suffix in BASELINES]
+    numbers: dict[str, list[float | None]] = {}
+    for metric in dict.fromkeys([*compared, *baselines, CEILING]):
+        numbers[metric] = [rounded(result.metrics.get(metric), SEED_DIGITS) for result in finished]
+    for metric, source in claim.beside.items():
+        measured = [read(result.run, source)[0].get(metric) for result in finished]
+        numbers[metric] = [None if each is None else rounded(float(np.mean(each)), SEED_DIGITS) for each in measured]
+    scores: dict[str, dict[str, Scored]] = {}  # of the clips, which the claim's comparisons need
+    for comparison in claim.comparisons if finished else ():
+        for side, score in ((comparison.better, comparison.score), (comparison.than, comparison.than_score)):
+            if side == name:
+                wanted = score or comparison.metric
+                scored = _scored(finished, comparison.measurement, wanted, comparison.metric, read)
+                scores.setdefault(comparison.measurement, {})[wanted] = scored
     arm = ArmScores(
         name=name,
         planned=len(cells),
         seeds=tuple(result.run.config.train.seed for result in finished),
         trainings=tuple(result.name for result in finished),
         clips=tuple(key["collect"] for key in keys),
-        numbers=_numbers(claim, finished, read),
-        scores=_scores(claim, name, finished, read),
+        numbers={metric: values for metric, values in numbers.items() if any(value is not None for value in values)},
+        scores=scores,
         absent=plan.absent.get((claim.name, name), ""),
         results=results,
     )
@@ -156,31 +172,6 @@ def merge_arms(one: ArmScores, other: ArmScores) -> ArmScores:
         scores=scores,
         minutes=round(sum(minutes) / len(minutes), 1) if minutes else None,
     )
-
-
-def _numbers(claim: Claim, finished: Sequence[RunResult], read: ReadScores) -> dict[str, list[float | None]]:
-    """Returns the scores over all clips: of the claim's metrics, of baselines, and those shown beside them."""
-    compared = dict.fromkeys([*(each.metric for each in claim.comparisons), *claim.shown])
-    names = dict.fromkeys([*compared, *(f"{name}{suffix}" for name in compared for suffix in BASELINES), CEILING])
-    found: dict[str, list[float | None]] = {}
-    for name in names:
-        found[name] = [rounded(result.metrics.get(name), SEED_DIGITS) for result in finished]
-    for name, source in claim.beside.items():
-        measured = [read(result.run, source)[0].get(name) for result in finished]
-        found[name] = [None if each is None else rounded(float(np.mean(each)), SEED_DIGITS) for each in measured]
-    return {name: values for name, values in found.items() if any(value is not None for value in values)}
-
-
-def _scores(claim: Claim, arm: str, finished: Sequence[RunResult], read: ReadScores) -> dict[str, dict[str, Scored]]:
-    """Returns the clips' scores that the claim's comparisons need of an arm."""
-    found: dict[str, dict[str, Scored]] = {}
-    for comparison in claim.comparisons if finished else ():
-        for side, score in ((comparison.better, comparison.score), (comparison.than, comparison.than_score)):
-            if side == arm:
-                name = score or comparison.metric
-                scored = _scored(finished, comparison.measurement, name, comparison.metric, read)
-                found.setdefault(comparison.measurement, {})[name] = scored
-    return found
 
 
 def _scored(finished: Sequence[RunResult], source: str, score: str, metric: str, read: ReadScores) -> Scored:

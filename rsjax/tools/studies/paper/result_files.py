@@ -41,7 +41,18 @@ def write_result(path: Path, outcome: Outcome, about: Mapping[str, Any], most: i
     content: dict[str, Any] = {"kind": KIND, **about}
     content["claim"] = {name: getattr(claim, name) for name in OF_CLAIM}
     content["claim"]["comparisons"] = [asdict(each) for each in claim.comparisons]
-    content["arms"] = [_arm_content(arm, claim.arm(arm.name)) for arm in outcome.arms]
+    content["arms"] = []
+    for each in outcome.arms:
+        values = {field.name: getattr(each, field.name) for field in fields(ArmScores) if field.name != "results"}
+        values["scores"] = {}
+        for source, by_name in each.scores.items():
+            values["scores"][source] = {}
+            for name, clips in by_name.items():
+                rows = [[None if np.isnan(value) else value for value in row] for row in clips.rows]
+                values["scores"][source][name] = {"rows": rows, "reason": clips.reason}
+        of_claim = claim.arm(each.name)
+        values |= {"equal": of_claim.equal, "published": dict(of_claim.published)}
+        content["arms"].append(values)
     text = as_text(content)
     path.with_suffix(".npz").unlink(missing_ok=True)
     if len(text) > most:
@@ -142,18 +153,6 @@ def provenance(runs: Sequence[Run]) -> dict[str, Any]:
         "machines": list(dict.fromkeys(machines)),
         "dates": " to ".join(dict.fromkeys([*days[:1], *days[-1:]])),
     }
-
-
-def _arm_content(arm: ArmScores, of_claim: Arm) -> dict[str, Any]:
-    """Returns an arm as JSON; NaN is null."""
-    content = {field.name: getattr(arm, field.name) for field in fields(ArmScores) if field.name != "results"}
-    scores: dict[str, dict[str, Any]] = {}
-    for source, by_name in arm.scores.items():
-        scores[source] = {}
-        for name, scored in by_name.items():
-            rows = [[None if np.isnan(value) else value for value in row] for row in scored.rows]
-            scores[source][name] = {"rows": rows, "reason": scored.reason}
-    return content | {"equal": of_claim.equal, "published": dict(of_claim.published), "scores": scores}
 
 
 def _arm_scores(content: Mapping[str, Any], beside: Path) -> ArmScores:

@@ -44,7 +44,16 @@ def rerun_view(store: Store, clips: int = 4, file: Path | None = None) -> list[s
     try:
         for _, _, record in clips_of(store, clips, damaged):
             if not shown:
-                _spawn(recording) if file is None else recording.save(file)
+                if file is not None:
+                    recording.save(file)
+                else:
+                    # The viewer may lie next to this Python, whose environment may be inactive.
+                    before = os.environ.get("PATH", "")
+                    os.environ["PATH"] = os.pathsep.join(filter(None, (before, str(Path(sys.executable).parent))))
+                    try:
+                        recording.spawn()
+                    finally:
+                        os.environ["PATH"] = before
             _log_clip(rerun, recording, f"clip_{shown:03d}", record)
             shown += 1
         recording.flush()
@@ -56,16 +65,6 @@ def rerun_view(store: Store, clips: int = 4, file: Path | None = None) -> list[s
             raise UserError(f"the Rerun viewer does not answer ({reason}); {cure}") from error
         raise UserError(f"{file}: cannot be written ({reason}); choose another place") from error
     return damaged
-
-
-def _spawn(recording: Any) -> None:
-    """Opens the viewer; looks for it on the path and next to this Python, whose environment may be inactive."""
-    before = os.environ.get("PATH", "")
-    os.environ["PATH"] = os.pathsep.join(filter(None, (before, str(Path(sys.executable).parent))))
-    try:
-        recording.spawn()
-    finally:
-        os.environ["PATH"] = before
 
 
 def _log_clip(rerun: Any, recording: Any, name: str, record: Record) -> None:

@@ -41,11 +41,8 @@ def probes_svg(curves: Curves, metrics: Sequence[Metric]) -> str:
     if contact.AXIS not in curves:
         return ""
     charts = [_curve_chart(curves, metric) for metric in metrics if metric.name in curves]
-    return charts_svg([*charts, _offset_chart(curves)], "drives and grasps", legend=True, height=2.3)
 
-
-def _offset_chart(curves: Curves) -> Chart:
-    def draw(axes: Axes) -> None:
+    def draw_offsets(axes: Axes) -> None:
         offsets = _numbers(curves[contact.AXIS])
         for suffix, (name, label) in {"_truth": (contact.SIMULATOR, "simulator"), "": (contact.MODEL, "model")}.items():
             low, high = (_numbers(curves[f"{name}_{side}"]) for side in ("low", "high"))
@@ -57,7 +54,7 @@ def _offset_chart(curves: Curves) -> Chart:
         axes.set_xlabel("offset of the fingers from the cube, cm", fontsize=8)
         axes.legend(fontsize=8, frameon=False)
 
-    return draw
+    return charts_svg([*charts, draw_offsets], "drives and grasps", legend=True, height=2.3)
 
 
 def _curve_chart(curves: Curves, metric: Metric) -> Chart:
