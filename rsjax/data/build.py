@@ -40,6 +40,16 @@ class _Episode:
     depth: list[float] = dataclasses.field(default_factory=list)
     successes: int = 0
 
+    def add(self, record: Record, number: int) -> None:
+        """Adds a clip."""
+        rows = Statistics.of(record["actions"][1:])
+        self.statistics = self.statistics.merged(rows) if self.statistics else rows
+        self.numbers.append(number)
+        self.successes += bool(record["success"][-1])
+        if record["depth"] is not None:
+            self.depth += [float(record["depth"].min()), float(record["depth"].max())]
+            self.depth = [min(self.depth), max(self.depth)]
+
 
 def write_clips(path: Path | str, clips: Iterable[Mapping[str, Any] | Clip], test_share: float = 0.1) -> Store:
     """Writes a store of clips, as :func:`rsjax.write_store` documents it."""
@@ -74,8 +84,15 @@ def write_clips(path: Path | str, clips: Iterable[Mapping[str, Any] | Clip], tes
                 raise StoreError(f"clip {count}: is a {type(given).__name__}, should be a dict with rgb and actions")
             record = _record(given, f"clip {count}", count)
             shapes = {name: array.shape for name, array in record.items() if isinstance(array, np.ndarray)}
-            _check_alike({name: shape for name, shape in shapes.items() if name != "depth"}, first, f"clip {count}")
-            _note(episodes.setdefault(record["provenance"]["episode"], _Episode()), record, count)
+            for name, shape in shapes.items():
+                if name != "depth" and first.setdefault(name, shape) != shape:
+                    hint = ""
+                    if name == "tracks":
+                        hint = f"; without tracks a clip gets {TRACKS} that are never visible"
+                    raise StoreError(
+                        f"clip {count}: {name} has the shape {shape}, that of the first clip {first[name]}{hint}"
+                    )
+            episodes.setdefault(record["provenance"]["episode"], _Episode()).add(record, count)
             scored |= "success" in given
             payload = encode(record)
             digest.update(payload)
@@ -146,17 +163,6 @@ def _write(path: Path, spooled: Source, episodes: dict[str, _Episode], share: fl
 def clip_labels(record: Record) -> dict[str, str]:
     """Returns a clip's labels, by which a curriculum or a split can choose it."""
     return {"task": record["task"]} | {name: record["provenance"][name] or UNKNOWN for name in _LABELS}
-
-
-def _note(episode: _Episode, record: Record, number: int) -> None:
-    """Adds a clip to the record of its episode."""
-    rows = Statistics.of(record["actions"][1:])
-    episode.statistics = episode.statistics.merged(rows) if episode.statistics else rows
-    episode.numbers.append(number)
-    episode.successes += bool(record["success"][-1])
-    if record["depth"] is not None:
-        episode.depth += [float(record["depth"].min()), float(record["depth"].max())]
-        episode.depth = [min(episode.depth), max(episode.depth)]
 
 
 def _record(clip: Mapping[str, Any], where: str, number: int) -> Record:
@@ -279,13 +285,3 @@ def _as_array(value: Any, what: str) -> np.ndarray:
         return np.asarray(value)
     except (TypeError, ValueError) as error:  # lists of other lengths
         raise StoreError(f"{what} cannot be made an array ({error}); give numbers of one shape") from error
-
-
-def _check_alike(shapes: dict[str, tuple[int, ...]], first: dict[str, tuple[int, ...]], where: str) -> None:
-    """Checks that a clip's arrays have the first clip's shapes, which ``first`` collects."""
-    for name, shape in shapes.items():
-        if first.setdefault(name, shape) != shape:
-            hint = ""
-            if name == "tracks":
-                hint = f"; without tracks a clip gets {TRACKS} that are never visible"
-            raise StoreError(f"{where}: {name} has the shape {shape}, that of the first clip {first[name]}{hint}")

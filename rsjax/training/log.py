@@ -258,9 +258,18 @@ class WandbRun:
         run_directory = directory.absolute().parent
         config = run_directory / "config.json"
         try:
+            path = directory / WANDB_ID
+            run_id = None
+            with suppress(FileError):
+                kept = read_json(path)
+                if resume and kept.get("project") == project:
+                    run_id = kept["id"]
+            if run_id is None:
+                run_id = uuid.uuid4().hex[:12]
+                write_json(path, {"project": project, "id": run_id})
             self._run = self._wandb.init(
                 project=project,
-                id=_run_id(directory / WANDB_ID, project, resume),
+                id=run_id,
                 resume="allow",
                 name=f"{run_directory.name}/{directory.name}",
                 group=run_directory.name,
@@ -299,14 +308,3 @@ class WandbRun:
         except Exception as error:  # as above
             self._run = None
             note(f"Weights & Biases is off until the next start ({first_line(error)}); training continues")
-
-
-def _run_id(path: Path, project: str, resume: bool) -> str:
-    """Returns the id in the file if it belongs to this project; otherwise a new one, which it writes there."""
-    with suppress(FileError):
-        kept = read_json(path)
-        if resume and kept.get("project") == project:
-            return kept["id"]
-    run_id = uuid.uuid4().hex[:12]
-    write_json(path, {"project": project, "id": run_id})
-    return run_id
