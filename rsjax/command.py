@@ -61,15 +61,7 @@ def main_errors() -> Iterator[None]:
             line, status = _answer(error, received)
             if line is None:
                 raise
-            # One line of what can be seen: control characters escaped, and long words cut off.
-            words = [
-                word if len(word) <= LONGEST_WORD else f"{word[:80]}… ({len(word)} characters)" for word in line.split()
-            ]
-            text = " ".join(words)
-            if len(text) > LONGEST_LINE:
-                text = f"{text[: LONGEST_LINE - 300]} … {text[-250:]}"
-            visible = "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in text)
-            print(visible, file=sys.stderr)
+            print(_readable(line), file=sys.stderr)
             # At exit, the processes of a distributed run wait for each other. A process that failed would wait in
             # vain, and jax would then abort with its own status.
             orderly = (os.EX_TEMPFAIL,) if _has_peers() else (UserError.status,)
@@ -136,6 +128,15 @@ def _bad_variable(error: BaseException | None) -> str:
 _JAX_REFUSES = re.compile(
     r"^(?:invalid truth value .* for environment '|Invalid value .* for JAX flag )(jax_\w+)", re.I
 )
+
+
+def _readable(line: str) -> str:
+    """Returns a message as one line of what can be seen: control characters escaped, and long words cut off."""
+    words = [word if len(word) <= LONGEST_WORD else f"{word[:80]}… ({len(word)} characters)" for word in line.split()]
+    text = " ".join(words)
+    if len(text) > LONGEST_LINE:
+        text = f"{text[: LONGEST_LINE - 300]} … {text[-250:]}"
+    return "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in text)
 
 
 def is_lead() -> bool:
