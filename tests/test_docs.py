@@ -58,6 +58,12 @@ def test_names_that_a_page_imports_exist(page: Path) -> None:
             assert found, f"{module} has no {name}"
 
 
+def test_extras_are_installed_without_a_checkout() -> None:
+    folders = [ROOT / name for name in ("rsjax", "benchmarks", "docs", "notebooks", "examples")]
+    texts = [path for folder in folders for path in folder.rglob("*") if path.suffix in (".py", ".md", ".ipynb")]
+    assert not [name_of(path) for path in [*PROJECT, *texts] if "pip install -e '.[" in path.read_text()]
+
+
 def test_the_page_on_clusters_shows_how_arrays_are_split() -> None:
     code = re.search(r'python -c "\n(.*?)"\n', (ROOT / "docs" / "cluster.md").read_text(), re.DOTALL)
     assert code is not None

@@ -79,7 +79,7 @@ def check_torch(config: Config) -> TorchBaseline:
     baseline.check(config)
     if find_spec("torch") is None:
         raise UserError(
-            "--torch needs PyTorch, which is not installed; pip install -e '.[torch]', or leave --torch out"
+            "--torch needs PyTorch, which is not installed; pip install 'rsjax[torch]', or leave --torch out"
         )
     for package in baseline.packages:
         if find_spec(package) is None:

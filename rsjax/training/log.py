@@ -234,7 +234,7 @@ def find_wandb() -> ModuleType:
         wandb = importlib.import_module("wandb")
         wandb.init  # noqa: B018  # a folder ./wandb, where W&B keeps its files, can be imported too
     except (ImportError, AttributeError) as error:
-        raise WandbError("--runtime.wandb needs Weights & Biases; install it: pip install -e '.[wandb]'") from error
+        raise WandbError("--runtime.wandb needs Weights & Biases; install it: pip install 'rsjax[wandb]'") from error
     return wandb
 
 

@@ -121,11 +121,11 @@ def test_when_it_cannot_start_the_error_is_one_line_with_the_cure(wandb: Stub, s
 @pytest.mark.parametrize("module", [None, SimpleNamespace()], ids=["nothing", "its own directory of files"])
 def test_without_the_package_the_error_has_the_install_command(monkeypatch: pytest.MonkeyPatch, module: Any) -> None:
     monkeypatch.setitem(sys.modules, "wandb", module)
-    with pytest.raises(WandbError, match=r"pip install -e '\.\[wandb\]'"):
+    with pytest.raises(WandbError, match=r"pip install 'rsjax\[wandb\]'"):
         find_wandb()
 
 
-@pytest.mark.skipif(importlib.util.find_spec("wandb") is None, reason="needs the extra: pip install -e '.[wandb]'")
+@pytest.mark.skipif(importlib.util.find_spec("wandb") is None, reason="needs the extra: pip install 'rsjax[wandb]'")
 def test_the_real_one_keeps_runs_offline(stage: Path) -> None:
     lines = (
         "import sys, pathlib, numpy\n"

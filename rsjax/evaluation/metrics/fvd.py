@@ -81,7 +81,7 @@ def _features(scene: Scene, videos: UInt8[np.ndarray, "B T H W 3"]) -> Float[np.
     if not path:
         raise Unavailable(f"no {FILE} in eval.weights: put it there, then --eval.weights DIR (docs/evaluation.md)")
     if find_spec("torch") is None:
-        raise Unavailable("FVD needs PyTorch: pip install -e '.[torch]'")
+        raise Unavailable("FVD needs PyTorch: pip install 'rsjax[torch]'")
     import torch
 
     device = "cuda" if torch.cuda.is_available() else "cpu"

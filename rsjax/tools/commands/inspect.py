@@ -30,7 +30,7 @@ class Options:
     clips: int = 12
     """How many clips to show on the sheet and in the viewer."""
     rerun: bool = False
-    """Open the clips with RGB, depth and tracks in the Rerun viewer (pip install -e '.[rerun]')."""
+    """Open the clips with RGB, depth and tracks in the Rerun viewer (pip install 'rsjax[rerun]')."""
     rerun_file: Path | None = None
     """Write the clips to this file instead; `rerun FILE` opens it."""
 

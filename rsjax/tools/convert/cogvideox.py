@@ -448,7 +448,7 @@ def embed_texts(source: Path, out: Path, tasks: Sequence[str], store: Path | Non
         torch, transformers = (importlib.import_module(name) for name in ("torch", "transformers"))
     except ImportError as error:
         raise ConvertError(
-            f"{source}: embedding texts needs transformers and PyTorch ({error}); pip install -e '.[text]'"
+            f"{source}: embedding texts needs transformers and PyTorch ({error}); pip install 'rsjax[text]'"
         ) from None
     for folder in ("text_encoder", "tokenizer"):
         if not (source / folder).is_dir():

@@ -183,7 +183,7 @@ def _read_torch(path: Path, holders: Sequence[str]) -> tuple[Tensors, dict[str, 
         torch: Any = importlib.import_module("torch")
     except ImportError:
         raise ConvertError(
-            f"{path}: reading {path.suffix} files needs PyTorch; install it (pip install -e '.[torch]'), or pass the "
+            f"{path}: reading {path.suffix} files needs PyTorch; install it (pip install 'rsjax[torch]'), or pass the "
             f"same weights as a {SAFE} file"
         ) from None
     content = _unpickled(path, torch)

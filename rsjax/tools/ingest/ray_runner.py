@@ -1,7 +1,7 @@
 """Runs the work items of an ingest on a Ray cluster: a pool of actors for each step, with its CPUs and shares of GPUs.
 
 Messages contain only ids, locations and marks; pictures are not sent. Every node must see the data set and the plan's
-folder under the same paths. Ray is an optional package (``pip install -e '.[ray]'``).
+folder under the same paths. Ray is an optional package (``pip install 'rsjax[ray]'``).
 """
 
 import asyncio
@@ -51,7 +51,7 @@ def run_on_ray(
     try:
         import ray
     except ImportError as error:
-        raise RayError("--runner ray needs Ray: pip install -e '.[ray]'") from error
+        raise RayError("--runner ray needs Ray: pip install 'rsjax[ray]'") from error
     here = not ray.is_initialized()
     if here:
         options: dict[str, Any] = {"log_to_driver": False, "logging_level": "error"}

@@ -36,7 +36,7 @@ def test_a_model_that_torch_lacks_is_refused(config: Config, line: str) -> None:
 
 def test_without_torch_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("benchmarks.pytorch.baselines.find_spec", lambda name: None)
-    with pytest.raises(UserError, match=r"pip install -e '\.\[torch\]'"):
+    with pytest.raises(UserError, match=r"pip install 'rsjax\[torch\]'"):
         check_torch(toy())
 
 

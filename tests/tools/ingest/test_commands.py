@@ -201,7 +201,7 @@ def test_without_the_viewer_both_of_its_options_are_named(
     monkeypatch.setitem(sys.modules, "rerun", None)
     clip_store(tmp_path / "a")
     text = command.refused(inspect, tmp_path / "a", option)
-    assert "--rerun and --rerun-file need the viewer: pip install -e '.[rerun]'" in text
+    assert "--rerun and --rerun-file need the viewer: pip install 'rsjax[rerun]'" in text
 
 
 def test_a_damaged_store_is_inspected_and_the_status_says_so(command: Command, tmp_path: Path) -> None:

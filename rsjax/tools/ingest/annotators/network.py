@@ -12,7 +12,7 @@ from rsjax.errors import first_line
 from rsjax.files import placeholder
 from rsjax.tools.ingest.annotators.protocols import AnnotationError, Annotator
 
-EXTRA = "pip install -e '.[annotate]'"
+EXTRA = "pip install 'rsjax[annotate]'"
 
 
 @dataclass(frozen=True)

@@ -121,7 +121,7 @@ class LanguageJudge:
             from transformers import AutoModelForImageTextToText, AutoProcessor
         except ImportError as error:
             raise UserError(
-                f"a vision-language judge needs torch and transformers ({error}): pip install -e '.[annotate]'"
+                f"a vision-language judge needs torch and transformers ({error}): pip install 'rsjax[annotate]'"
             ) from error
         if not (path / "config.json").exists():
             raise UserError(f"{path}: no config.json, so no model of transformers is there; download one to it")

@@ -37,7 +37,7 @@ def rerun_view(store: Store, clips: int = 4, file: Path | None = None) -> list[s
     try:
         import rerun
     except ImportError as error:
-        raise UserError("--rerun and --rerun-file need the viewer: pip install -e '.[rerun]'") from error
+        raise UserError("--rerun and --rerun-file need the viewer: pip install 'rsjax[rerun]'") from error
     damaged = list[str]()
     shown = 0
     recording = rerun.RecordingStream("rsjax")

@@ -14,7 +14,7 @@ from tests.data.clips import clip, clip_store
 
 def test_without_the_viewer_its_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
-    with pytest.raises(UserError, match=r"pip install -e '\.\[rerun\]'"):
+    with pytest.raises(UserError, match=r"pip install 'rsjax\[rerun\]'"):
         rerun_view(clip_store(tmp_path / "a"))
 
 

@@ -32,7 +32,7 @@ def test_without_torch_the_extra_is_named(tmp_path, monkeypatch):
     for module in EXTRA:
         monkeypatch.setitem(sys.modules, module, None)
     for network in networks(tmp_path).values():
-        with pytest.raises(AnnotationError, match=rf"{network.title} needs torch .*pip install -e '\.\[annotate\]'"):
+        with pytest.raises(AnnotationError, match=rf"{network.title} needs torch .*pip install 'rsjax\[annotate\]'"):
             network.load()
 
 
