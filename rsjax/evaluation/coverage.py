@@ -30,6 +30,7 @@ from rsjax.data.store import Store
 from rsjax.evaluation.generation import teacher_forced
 from rsjax.evaluation.results import fingerprint
 from rsjax.files import regular, write_file
+from rsjax.model_directory import output_directory
 from rsjax.models.trained import TrainedModel
 
 FOLDER = "coverage"  # in the run directory
@@ -149,10 +150,13 @@ def make_coverage(trained: TrainedModel, store: Store, run: Path, clips: int = C
     """Returns the bank of a run's model, made once and kept in ``RUN/coverage``; None for a family without features.
 
     Args:
-        store: the run's clips, whose train split the model learned from.
+        store: the run's clips, whose train split the model learned from; without one, as in a saved model, there is no
+            bank.
         clips: training clips in the bank, spread over the split.
     """
-    folder = run / FOLDER
+    if "train" not in store.splits:
+        return None
+    folder = output_directory(run, FOLDER)
     key = coverage_key(trained, store, clips)
     with make_once(folder, key, refuse=None, wait=True) as work:
         if not work.finished:
@@ -169,7 +173,7 @@ def make_coverage(trained: TrainedModel, store: Store, run: Path, clips: int = C
 
 def read_coverage(trained: TrainedModel, store: Store, run: Path, clips: int = CLIPS) -> Coverage | None:
     """Returns the bank that :func:`make_coverage` has made of this model; None if there is none, or it is damaged."""
-    folder = run / FOLDER
+    folder = output_directory(run, FOLDER)
     if not is_finished(folder, coverage_key(trained, store, clips)):
         return None
     try:

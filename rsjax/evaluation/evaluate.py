@@ -142,7 +142,8 @@ def evaluate(
     """Scores a model and two baselines on held-out clips: the last prompt frame repeated, and the reconstruction.
 
     Args:
-        store: the clips of the run; the train split determines the range of uniform random actions.
+        store: the clips of the run; the train split determines the range of uniform random actions. A saved model's few
+            clips have none, and no scores that need it.
         protocol: the protocol to evaluate by; None: that of the run's own configuration.
         eval_clips: the clips to score; None: those of the store's test split.
         folder: where generated batches are kept until the evaluation is finished; None: in memory.
@@ -225,13 +226,12 @@ def plan(trained: TrainedModel, store: Store, eval_clips: EvaluationClips, folde
     clips = eval_clips.clips
     draws = {OWN: clips.actions[None]}
     if protocol.action_draws and trained.config.model.takes_actions:
-        train = store.source("train")
-        recorded = [clip["actions"] for _, clip in readable(train, spread(train, RANGE_CLIPS))]
-        low, high = delta_psnr.action_range(np.stack(recorded))
-        draws |= {
-            "other": clips.actions[delta_psnr.other_clips(len(clips.actions), protocol.action_draws, seed=0)],
-            "uniform": delta_psnr.uniform_actions(clips.actions, low, high, protocol.action_draws, seed=0),
-        }
+        draws["other"] = clips.actions[delta_psnr.other_clips(len(clips.actions), protocol.action_draws, seed=0)]
+        if "train" in store.splits:
+            train = store.source("train")
+            recorded = [clip["actions"] for _, clip in readable(train, spread(train, RANGE_CLIPS))]
+            low, high = delta_psnr.action_range(np.stack(recorded))
+            draws["uniform"] = delta_psnr.uniform_actions(clips.actions, low, high, protocol.action_draws, seed=0)
     if protocol.samples > 1:
         truth = scored_frames(trained, protocol, clips)
     else:
@@ -326,10 +326,10 @@ def localiser_of(settings: EvalConfig, store: Store, records: Sequence[Record]) 
     """Trains the network that reads where cube and gripper are; returns None if the clips do not record it.
 
     Args:
-        store: the store of the run; the localiser learns from its training clips.
+        store: the store of the run; the localiser learns from its training clips, if there are any.
         records: the scored clips.
     """
-    if recorded_places(records) is None:
+    if recorded_places(records) is None or "train" not in store.splits:
         return None
     train = store.source("train")
     clips = [clip for _, clip in readable(train, spread(train, LOCALISER_CLIPS))]
@@ -422,6 +422,8 @@ def _score(metric: Metric, scenes: Mapping[str, Scene], protocol: Protocol) -> d
         Unavailable: the prediction cannot be scored. A baseline that cannot be scored is left out.
     """
     if not scenes[""].alternatives.keys() >= set(metric.needs):
+        if scenes[""].alternatives:
+            raise Unavailable("there are no training clips, which give the range of random actions")
         raise Unavailable(f"protocol {protocol.name} generates no videos under other actions")
     scores = _named(metric, scenes[""], "")
     if metric.needs:  # the first frame repeated ignores actions

@@ -40,5 +40,5 @@ def _errors(scene: Scene, name: str) -> Scores:
 
 def _located(scene: Scene) -> Located:
     if scene.located is None:
-        raise Unavailable("the clips do not say where cube and gripper are, as the simulator's do")
+        raise Unavailable("the clips do not say where cube and gripper are, as the simulator's training clips do")
     return scene.located

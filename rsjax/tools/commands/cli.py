@@ -283,7 +283,7 @@ _called: dict[str, str] = {}  # the command that runs, and what it runs on
 
 def _remember(prog: str, options: Any, run: Path | None = None) -> None:
     """Notes what the command was called with, for its last line."""
-    for name in ("run", "runs", "store", "made_run"):
+    for name in ("made_run", "run", "runs", "store"):
         value = getattr(options, name, None)
         if run is None and value:
             run = value[0] if isinstance(value, tuple) else value

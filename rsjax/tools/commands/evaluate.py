@@ -1,4 +1,4 @@
-"""Evaluates trained runs by a protocol. ``rsjax evaluate runs/tiny --protocol paper``"""
+"""Evaluates trained models by a protocol. ``rsjax evaluate runs/tiny --protocol paper``"""
 
 import dataclasses
 import sys
@@ -32,7 +32,7 @@ class Options:
     """Generates from held-out clips by a protocol and scores all metrics; results record all that affects scores."""
 
     runs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN …")] = ()
-    """Run directories, made by rsjax train."""
+    """Run directories, made by rsjax train; saved models, on the clips in them; or tiny or multitask, the package's."""
     protocol: str = "paper"
     """paper, 1xgpt, ivideogpt-bair, horizon48, unseen, or run: that of the run's own configuration."""
     data: Path | None = None
@@ -42,7 +42,7 @@ class Options:
     data_dir: Path = Path("data")
     """Directory of simulated data sets."""
     store: Path | None = None
-    """The new path of the run's store of ingested clips, if it was moved."""
+    """The new path of the run's store of ingested clips, if it was moved; of a saved model, that of its training."""
     overwrite: bool = False
     """Evaluate again even if a result is up to date."""
     second_takes: bool = False
@@ -80,6 +80,15 @@ class Options:
     process_id: int | None = None
     """Number of this process, from 0, with --coordinator."""
 
+    @property
+    def made_run(self) -> Path | None:
+        """The run of the last line of the output: where the first model's results are."""
+        from rsjax.model_directory import locate, output_directory
+
+        if not self.runs:
+            return None
+        return output_directory(locate(self.runs[0]), "evaluations").parent
+
 
 @main_errors()
 def main() -> None:
@@ -94,6 +103,7 @@ def main() -> None:
     distributed.initialize(options.coordinator, options.processes, options.process_id)
     from rsjax.evaluation.results import read_result
     from rsjax.evaluation.verdict import verdict
+    from rsjax.model_directory import locate
     from rsjax.tools.pipeline.evaluations import Request, evaluate_run
 
     changes = {name: value for name in CHANGES if (value := getattr(options, name)) is not None}
@@ -103,7 +113,7 @@ def main() -> None:
     where = (options.data, options.split, options.store, options.overwrite, options.second_takes)
     request = Request(options.protocol, changes, settings, *where)
     for run in options.runs:
-        for folder in evaluate_run(run, options.data_dir, request):
+        for folder in evaluate_run(locate(run), options.data_dir, request):
             if distributed.is_lead():
                 print(f"result: {(folder / 'result.json').absolute()}")
                 print(verdict(read_result(folder).metrics))

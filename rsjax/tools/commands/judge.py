@@ -32,6 +32,7 @@ def main() -> None:
     options = parse_options(sys.argv[1:], "rsjax judge", Options.__doc__ or "", Options())
     from rsjax.tools.policies.judges import head_judge, judge_training
     from rsjax.tools.policies.judges.validation import table, whole_clips
+    from rsjax.tools.policies.run_data import with_clips
     from rsjax.tools.studies.tables import as_markdown
 
     make = judge_training.make_judge
@@ -39,7 +40,7 @@ def main() -> None:
     if options.head:
         make = judge_training.validate_heads
         folder = head_judge.FOLDER
-    result = make(options.run, options.data_dir, options.store, part(options, JudgeSettings))
+    result = make(with_clips(options.run), options.data_dir, options.store, part(options, JudgeSettings))
     print(f"judge on {result['clips']} held-out clips: frames by label\n\n{as_markdown(table(result))}\n")
     if whole := whole_clips(result):
         print(f"whole clips, by how many frames in a row must show success\n\n{as_markdown(whole)}\n")

@@ -16,7 +16,7 @@ class Options(Synthesis):
     """Generates videos from a data set's first frames and actions; writes them as a store and as LeRobotDatasets."""
 
     run: tyro.conf.Positional[Path] = tyro.MISSING
-    """A run directory, made by rsjax train."""
+    """A run directory, made by rsjax train; with --store also a saved model."""
     data_dir: Path = Path("data")
     """Directory of simulated data sets."""
     store: Path | None = None
@@ -33,13 +33,16 @@ def main() -> None:
     tune_process()
     options = parse_options(sys.argv[1:], "rsjax synthesize", Options.__doc__ or "", Options())
     from rsjax.data.store import open_store
+    from rsjax.model_directory import locate, output_directory
     from rsjax.progress import Progress
-    from rsjax.tools.policies.run_data import RunData
+    from rsjax.tools.policies.run_data import RunData, with_clips
     from rsjax.tools.policies.studies.synthesis import synthesize
     from rsjax.tools.policies.worlds.actions import action_range
 
-    run = RunData(options.run, options.data_dir)
-    out = options.out or options.run / "synthetic"
+    if not options.store:
+        with_clips(options.run, ", or a store of clips with --store")
+    run = RunData(locate(options.run), options.data_dir)
+    out = options.out or output_directory(run.run, "synthetic")
     store = open_store(options.store) if options.store else run.clips
     limits = action_range(run.config, run.trained.assets.normalization)
     judge = run.judge() if options.judge else None

@@ -9,6 +9,7 @@ from rsjax.data.clips import readable, spread
 from rsjax.data.store import StoreError
 from rsjax.evaluation.depth_estimator import DepthEstimator
 from rsjax.evaluation.depth_network import DepthNetwork, initial, train_depth_network
+from rsjax.model_directory import is_saved
 from rsjax.tools.pipeline.metric_files import load_estimator
 from rsjax.tools.pipeline.run import Run
 from rsjax.training.checkpoint import load_weights, save_weights
@@ -61,13 +62,15 @@ def make_depth_network(run: Run) -> None:
 
 
 def depth_estimator(run: Run) -> DepthEstimator | None:
-    """Returns the estimator of a run's configuration, trained or loaded; None if it names none.
+    """Returns the estimator of a run's configuration, trained or loaded; None if it names none, or none can be trained.
 
     Raises:
         UserError: the estimator cannot be loaded, or the clips have no depth from which it could learn.
     """
     if not run.config.eval.simulator_steps:
         return load_estimator(run.config.eval)
+    if is_saved(run.directory):  # which has no training clips
+        return None
     make_depth_network(run)
     untrained = initial(run.config.clips.image_size)
     return DepthNetwork(load_weights(run.output("depth_estimator") / _WEIGHTS, untrained))

@@ -49,11 +49,14 @@ def _lacking(splits: Collection[str], wanted: tuple[str, ...]) -> list[str]:
 
 
 def evaluation_store(run: Run, store: Store, protocol: Protocol) -> Store:
-    """Returns the run's store, or one of longer episodes, unseen scenes or contacts, simulated if necessary."""
+    """Returns the run's store, or one of longer episodes, unseen scenes or contacts, simulated if necessary.
+
+    With the few clips of a saved model, nothing is simulated.
+    """
     sim = run.config.sim
     workers = run.config.runtime.workers
     needed = protocol.prompt_frames + protocol.horizon
-    if run.config.data is not None:
+    if run.config.data is not None or "train" not in store.splits:
         return store
     known = not _lacking(store.splits, protocol.splits)
     count = min(protocol.clips, sim.test_episodes)
@@ -105,6 +108,8 @@ def probes_of(run: Run, store: Store, eval_clips: EvaluationClips) -> Probes | U
     source = store.manifest.get("source")
     if not run.config.model.takes_actions:
         return Unavailable("the model takes no actions")
+    if "train" not in store.splits:
+        return Unavailable("there are no training clips, from which a network learns to read grasps and drives")
     if source != source_name(SimConfig()):
         return Unavailable(f"grasps and drives are simulated in Lift alone; the clips are of {source or 'recordings'}")
     if eval_clips.split != "test":

@@ -22,6 +22,7 @@ from rsjax.evaluation.metrics.physics_iq import THRESHOLD
 from rsjax.evaluation.protocols import Protocol, find, label, of_run
 from rsjax.evaluation.results import NAME, Evaluation, fingerprint, read_result, result_of, write_result
 from rsjax.files import FileError, disk_guard, making, safe_id
+from rsjax.model_directory import is_saved, output_directory
 from rsjax.models.load_run import load, load_config
 from rsjax.models.trained import TrainedModel
 from rsjax.progress import note
@@ -51,7 +52,8 @@ class Request:
         settings: fields of :class:`rsjax.config.EvalConfig` to change, such as paths of weights.
         data: a store with the clips to score; None: the run's own.
         splits: splits of that store; empty: the protocol's.
-        store: the new path of the run's store of ingested clips, if it was moved.
+        store: the new path of the run's store of ingested clips, if it was moved; of a saved model, the store with all
+            clips of its training.
         overwrite: whether to replace results that are up to date.
         retakes: whether to simulate the scored clips once more, for Physics-IQ's score.
     """
@@ -69,7 +71,10 @@ class Request:
 def evaluate_run(directory: Path, data: Path, request: Request) -> Iterator[Path]:
     """Evaluates one run, each split by itself; skips results that are up to date. All processes call it together.
 
+    A saved model is scored on the clips in it, without the scores that training clips are needed for.
+
     Args:
+        directory: of a run or a saved model.
         data: the directory of simulated data sets.
 
     Yields:
@@ -80,7 +85,9 @@ def evaluate_run(directory: Path, data: Path, request: Request) -> Iterator[Path
             second takes of them cannot be simulated.
     """
     config = load_config(directory)
-    config = relocated(config, request.store) if request.store else config
+    saved = is_saved(directory)
+    if request.store and not saved:
+        config = relocated(config, request.store)
     config = replace(config, eval=replace(config.eval, **request.settings))
     check_metric_files(config.eval)
     standard = find(request.protocol, config)
@@ -93,8 +100,10 @@ def evaluate_run(directory: Path, data: Path, request: Request) -> Iterator[Path
         note(f"a model of family {config.model.family!r} has no {missing}, which {protocol.name} fixes; left out")
     trained = resampled(trained, {name: value for name, value in protocol.sampling.items() if name in known})
     run = Run(config, directory, data)
-    store = run.open_clips()
+    store = open_store(request.store) if saved and request.store else run.open_clips()
     check_depth(run)
+    if request.retakes and "train" not in store.splits:
+        raise UserError(f"{directory}: second takes are kept beside a run's clips; name these with --store")
     if request.data:
         scored_store = open_store(request.data)
     else:
@@ -111,7 +120,7 @@ def evaluate_run(directory: Path, data: Path, request: Request) -> Iterator[Path
         if request.retakes:
             name = f"{name},second-takes"
             chosen = with_second_takes(chosen, config.runtime.workers)
-        folder = directory / FOLDER / name
+        folder = output_directory(directory, FOLDER) / name
         evaluate_into(folder, name, trained, run, store, chosen, request.overwrite)
         yield folder
 

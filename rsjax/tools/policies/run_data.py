@@ -11,7 +11,7 @@ from rsjax.data.clips import readable
 from rsjax.data.store import Store, open_store
 from rsjax.errors import UserError
 from rsjax.evaluation.coverage import make_coverage
-from rsjax.model_directory import has_weights
+from rsjax.model_directory import has_weights, is_saved, locate
 from rsjax.models.load_run import load, load_config
 from rsjax.models.trained import TrainedModel
 from rsjax.tools.pipeline.provenance import training_settings
@@ -136,6 +136,23 @@ class RunData:
     def demos(self, only: Only = "success", seed: int = 0) -> Demos:
         """Returns the run's training clips as demonstrations."""
         return load_demos(self.clips, ["train"], only, seed)
+
+
+def with_clips(run: Path, cure: str = "") -> Path:
+    """Returns the directory of a run, which knows the clips of its training.
+
+    Args:
+        cure: what else could be done without them.
+
+    Raises:
+        UserError: it is a saved model, which has a few held-out clips at most.
+    """
+    if is_saved(locate(run)):
+        raise UserError(
+            f"{run}: a saved model, without the clips of its training; name a run directory, which rsjax train "
+            f"makes{cure}"
+        )
+    return run
 
 
 def synthetic_demos(path: Path, run: Path) -> Demos:

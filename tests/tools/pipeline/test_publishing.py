@@ -1,6 +1,8 @@
 """Tests saving a finished run to publish, and what the commands do with the directory it makes."""
 
 import json
+import re
+import shutil
 from pathlib import Path
 
 import av
@@ -12,8 +14,10 @@ import rsjax
 from rsjax.clip import GENERATED_MARK
 from rsjax.data.clips import load_clips
 from rsjax.errors import UserError
+from rsjax.evaluation.results import read_result
 from rsjax.model_directory import PRETRAINED, SHIPPED
 from rsjax.models.load_run import load_config
+from rsjax.tools.commands.evaluate import Options
 from rsjax.tools.pipeline.provenance import record_start
 from rsjax.tools.pipeline.publishing import Publication, loss_of_rounding, predicted_psnr, publish
 from rsjax.tools.pipeline.run import Run
@@ -22,6 +26,7 @@ from rsjax.tools.play.play_run import PlayRun
 from rsjax.tools.policies.run_data import RunData
 from rsjax.training.checkpoint import save_weights
 from tests.tools.pipeline import toy
+from tests.tools.pipeline.conftest import Commands
 
 
 @pytest.fixture(scope="module")
@@ -110,10 +115,36 @@ def test_videos_the_demo_and_the_playground_work_from_the_directory_alone(publis
     assert play.controls.width == toy.config().clips.action_dim
 
 
+def test_a_saved_model_is_evaluated_on_its_own_clips(published: Path, command: Commands, tmp_path: Path) -> None:
+    saved = shutil.copytree(published, tmp_path / "saved")
+    printed = command.here("experiments.evaluate", saved, "--protocol", "run")
+    folder = Path(printed.split("result: ")[1].partition("\n")[0]).parent
+    assert folder == saved / "evaluations" / "run"
+    result = read_result(folder)
+    model = rsjax.load(published)
+    clips = load_clips(Run(model.config, published, Path("nowhere")).open_clips(), 2)
+    assert result.metrics["psnr"] == pytest.approx(predicted_psnr(model, clips).mean(), abs=0.01)
+    assert "no training clips" in result.reasons["delta_psnr_uniform"]
+    assert result.metrics["delta_psnr"] is not None
+    assert Options((Path("tiny"),)).made_run == Path("runs/tiny")
+
+
+def test_commands_that_need_training_clips_say_so_of_a_saved_model(published: Path, command: Commands) -> None:
+    for module in ("experiments.judge", "experiments.synthesize"):
+        assert "without the clips of its training; name a run directory" in command.refused(module, published)
+        assert "tiny: a saved model, without the clips" in command.refused(module, "tiny")
+
+
 def test_an_unfinished_run_is_refused(run: Run, tmp_path: Path) -> None:
     with pytest.raises(UserError) as caught:
         publish(Run(run.config, tmp_path, tmp_path), tmp_path / "out", Publication())
     assert "metrics.json: missing; the train command of this run makes it" in str(caught.value)
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_the_card_says_that_rounding_costs_next_to_nothing(name: str) -> None:
+    found = re.search(r"a loss of ([\d.]+) dB", (PRETRAINED / name / "README.md").read_text())
+    assert found is not None and float(found[1]) <= 0.02
 
 
 @pytest.mark.parametrize("name", SHIPPED)
