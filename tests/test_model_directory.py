@@ -52,6 +52,14 @@ def test_a_saved_model_comes_back_and_generates_the_same(model: TrainedModel, tm
     np.testing.assert_array_equal(generated(loaded).rgb, generated(model).rgb)
 
 
+def test_a_model_is_shown_in_one_line(model: TrainedModel, tmp_path: Path) -> None:
+    count = sum(x.size for x in jax.tree.leaves(model.params))
+    shown = repr(replace(model, directory=tmp_path))
+    assert (
+        shown == f"TrainedModel('debug', roboscape, {count:,} parameters, clips of 6 frames of 64 pixels, {tmp_path})"
+    )
+
+
 def test_half_precision_rounds_each_parameter_once_and_halves_the_file(model: TrainedModel, tmp_path: Path) -> None:
     model.save(tmp_path / "whole")
     model.save(tmp_path / "half", "float16")

@@ -5,6 +5,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, get_args
 
+import jax
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 
@@ -36,6 +37,14 @@ class TrainedModel:
     params: Params
     assets: Assets
     directory: Path | None = None
+
+    def __repr__(self) -> str:
+        count = sum(x.size for x in jax.tree.leaves(self.params))
+        clips = self.config.clips
+        return (
+            f"TrainedModel({self.config.name!r}, {self.config.model.family}, {count:,} parameters, clips of "
+            f"{clips.frames} frames of {clips.image_size} pixels, {self.directory})"
+        )
 
     def generate(
         self,
