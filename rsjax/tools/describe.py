@@ -163,7 +163,7 @@ def render(description: Description) -> Group:
         unit = {"bytes": "B", "flops": "FLOP"}.get(name.partition("_")[0], "")
         exponent = next((exponent for exponent in PREFIXES if value >= 10**exponent), 0)
         table.add_row(_title(name), f"{value:,}", f"{value / 10**exponent:.3g} {PREFIXES[exponent]}{unit}")
-    return Group(*trees, table, f"On accelerators: rsjax compile {description.name} --target h100x8")
+    return Group(*trees, table)
 
 
 def _grow(tree: Tree, shapes: Shapes) -> None:

@@ -1,6 +1,7 @@
 """Describes a preset: modules, parameters, operations, memory. ``rsjax describe roboscape_s``"""
 
 import json
+import shlex
 import sys
 from dataclasses import dataclass
 
@@ -31,3 +32,4 @@ def main() -> None:
         print(json.dumps({"preset": description.name} | description.figures, indent=1))
     else:
         Console().print(render(description))
+        print(f"On accelerators: rsjax compile {shlex.quote(sys.argv[1])} --target h100x8")
