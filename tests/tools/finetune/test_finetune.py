@@ -1,12 +1,15 @@
 """A toy model with random weights, fine-tuned for a few steps on a folder of noise."""
 
 import shutil
+import sys
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import patch
 
 import jax
 import numpy as np
 import pytest
+from safetensors.numpy import save_file
 
 from rsjax.config import (
     BackwardsConfig,
@@ -21,9 +24,8 @@ from rsjax.data.store import Store, open_store
 from rsjax.errors import UserError
 from rsjax.files import write_json
 from rsjax.models.load_run import load
-from rsjax.models.roboscape.architecture import Architecture
-from rsjax.models.roboscape.transformer import Transformer
-from rsjax.tools.convert import directory
+from rsjax.tools.commands import describe
+from rsjax.tools.convert import genie, tokenizer
 from rsjax.tools.convert.directory import load_world_model
 from rsjax.tools.finetune.finetune import finetune, make_clips, prepare
 from rsjax.tools.finetune.recipe import FIXED_CAMERA, LEAST_BETWEEN, Finetuning, Reconstruction, finetuned, moving_share
@@ -33,6 +35,7 @@ from rsjax.tools.pipeline.run import Run
 from rsjax.tools.pipeline.stages import prepare as prepare_tokens
 from rsjax.tools.pipeline.stages import train_tokenizer, train_world_model
 from rsjax.training.checkpoint import save_weights
+from tests.tools.convert.public import genie_shapes, random_tensors, tokenizer_shapes
 from tests.tools.pipeline import toy
 
 CUTTING = Cutting(test_share=0.4, validation_share=0.2, workers=0)
@@ -91,6 +94,12 @@ def test_the_run_starts_from_the_model_and_is_like_any_other(whole: Run, model: 
     jax.tree.map(np.testing.assert_array_equal, start, {name: own[name] for name in start})
 
 
+def test_a_prepared_run_can_be_described(whole: Run, capsys: pytest.CaptureFixture[str]) -> None:
+    with patch.object(sys, "argv", ["rsjax describe", str(whole.directory)]):
+        describe.main()
+    assert f"rsjax compile {whole.directory} --target" in capsys.readouterr().out
+
+
 def test_killed_and_started_again_it_has_the_same_weights(whole: Run) -> None:
     before = load(whole.directory).params
     shutil.rmtree(whole.output("world_model"))
@@ -99,6 +108,22 @@ def test_killed_and_started_again_it_has_the_same_weights(whole: Run) -> None:
         shutil.rmtree(whole.directory / "world_model" / "checkpoints" / str(step))
     train_world_model(whole, resume=True)
     jax.tree.map(np.testing.assert_array_equal, before, load(whole.directory).params)
+
+
+def test_missing_depth_is_said_with_the_way_to_get_it(
+    whole: Run, model: Path, data: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    finetune(find_source(model), Recordings("npz", data), CUTTING, SETTINGS, whole.directory, only_cost=True)
+    said = capsys.readouterr().out
+    assert "no clip has depth: the depth loss is masked" in said and "--depth video-depth-anything:" in said
+
+
+def test_a_share_of_the_steps_trains_on_short_clips(whole: Run, model: Path) -> None:
+    halves = replace(SETTINGS, short_share=0.5)
+    short, long = finetuned(find_source(model), open_store(whole.clips), "", halves, adapts=True).train.curriculum
+    assert (short.frames, long.frames) == (2, 0)
+    assert short.epochs == long.epochs == SETTINGS.steps / 2 * toy.config().train.batch_size / 2
+    assert len(whole.config.train.curriculum) == 1
 
 
 def test_another_model_or_setting_needs_another_directory(whole: Run, model: Path) -> None:
@@ -120,17 +145,30 @@ def test_a_moved_model_is_the_same_and_other_weights_are_not(whole: Run, model: 
 
 
 def test_public_weights_are_taken_by_path(whole: Run, tmp_path: Path) -> None:
-    cfg = toy.config()
-    alone = replace(Architecture.create(cfg), depth="none", action_encoder="none", action_inputs=0)
+    """In the format of Open-MAGVIT2 and 1xgpt: codes of 6 bits, 4 × 4 in a frame of 64 pixels."""
+    magvit = random_tensors(tokenizer_shapes(32, (1, 1, 1, 1, 1), res=1, bits=6, adaptive=False))
+    published = random_tensors(genie_shapes(layers=2, d=16, heads=2, frames=5, cells=16, codes=8, qk_norm=False))
+    settings = {"num_layers": 2, "num_heads": 2, "d_model": 16, "T": 5, "S": 16, "image_vocab_size": 64}
+    write_json(tmp_path / "genie" / "config.json", settings)
+    save_file(magvit, tmp_path / "magvit.safetensors")
+    save_file(published, tmp_path / "genie" / "model.safetensors")
     public = tmp_path / "public"
-    directory.save(public, cfg.tokenizer, toy.tokenizer_params())
-    params = jax.tree.map(
-        lambda x: np.ones(x.shape, x.dtype), jax.eval_shape(Transformer(alone).init_params, jax.random.key(0))
-    )
-    directory.save(public, alone, params)
-    config = prepare(find_source(public), open_store(whole.clips), SETTINGS, tmp_path / "out")
-    assert isinstance(config.model, GenieConfig) and isinstance(cfg.model, RoboScapeConfig)
-    assert (config.model.width, config.clips.action_dim) == (cfg.model.width, 6)
+    tokenizer.convert(tmp_path / "magvit.safetensors", public, "raw")
+    genie.convert(tmp_path / "genie" / "model.safetensors", public, None)
+    two_steps = replace(SETTINGS, steps=2, tokenizer="keep")
+    source = find_source(public)
+    small = replace(source.config, train=replace(source.config.train, batch_size=2))
+    config = prepare(replace(source, config=small), open_store(whole.clips), two_steps, tmp_path / "out")
+    assert isinstance(config.model, GenieConfig)
+    assert (config.model.width, config.clips.action_dim) == (16, 6)
+    run = Run(config, tmp_path / "out", Path("data"))
+    run.prepare(overwrite=False)
+    train_tokenizer(run, resume=True)
+    prepare_tokens(run)
+    train_world_model(run, resume=True)
+    embedding = load(run.directory).params["rgb_embed"]["factored_embed_0"]["embedding"]
+    change = np.abs(embedding - published["token_embed.factored_embeds.0.weight"])
+    assert 0 < change.max() < 0.1
 
 
 def test_what_stands_still_is_kept_if_the_camera_does_not_move_or_by_word(whole: Run, model: Path) -> None:
