@@ -10,7 +10,7 @@ import time
 from collections.abc import Iterator, Sequence
 from operator import attrgetter
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, get_args, get_type_hints
+from typing import Annotated, Any, NoReturn, TypeVar, get_args, get_type_hints
 
 import tyro
 
@@ -20,7 +20,7 @@ from rsjax.config.config_fields import config_fields, with_sections, with_values
 from rsjax.config.curriculum import read_curriculum, write_curriculum
 from rsjax.errors import did_you_mean
 from rsjax.files import check_place
-from rsjax.tools.commands.first_screens import FIRST_SCREENS
+from rsjax.tools.commands.first_screens import FIRST_SCREENS, FirstScreen
 
 Options = TypeVar("Options")
 
@@ -62,6 +62,9 @@ PLACES = {
     **dict.fromkeys(("out", "run_dir", "dir", "into", "blind"), "directory"),
     **dict.fromkeys(("json", "dump", "fix", "sheet", "rerun_file"), "file"),
 }
+
+# Options with which a command only shows what it would do.
+SHOWING = ("dry_run", "list")
 
 REGISTRY = tyro.constructors.ConstructorRegistry()
 
@@ -165,8 +168,8 @@ def parse(
     chosen, argv = choose_sections(preset, argv)
     fields = chosen
     if {"-h", "--help"}.intersection(argv):
-        fields = _first_fields(chosen)
-        description = f"{description} Every field: {prog} --help-all"
+        parts = {"options": options, "preset": preset_options, "fields": _first_fields(chosen)}
+        _show_help(parts, prog, f"{description} Every field: {prog} --help-all")
     elif "--help-all" in argv:
         sections = [
             f"--{_flag(name)} {'|'.join(get_args(field.kind))}, now {field.value}"
@@ -224,12 +227,7 @@ def parse_options(argv: Sequence[str], prog: str, description: str, options: Opt
     """Parses the arguments of a command without a preset. Arguments and errors as in :func:`parse`."""
     command.refuse_repeated(argv, _adding(options))
     if {"-h", "--help"}.intersection(argv):
-        text = _help({"options": options}, prog, description)
-        head, line, body = text.partition("\n positional arguments")
-        if not line:
-            head, line, body = text.partition("\n options")
-        print(f"{with_first_screen(head, prog, text)}\n{line}{body}", end="")
-        raise SystemExit(0)
+        _show_help({"options": options}, prog, description)
     parsed = _parse({"options": options}, argv, prog, description).options
     _remember(prog, parsed)
     return parsed
@@ -243,7 +241,7 @@ def with_first_screen(head: str, prog: str, text: str) -> str:
         prog: the command as the user types it; one without a first screen keeps the head as it is.
         text: the whole help, which describes the options.
     """
-    screen = FIRST_SCREENS.get(_name(prog))
+    screen = _screen(prog)
     if screen is None:
         return head
     lines = [head.rstrip(), "", f"Example:  {screen.example}", f"Output:   {screen.output}"]
@@ -253,8 +251,8 @@ def with_first_screen(head: str, prog: str, text: str) -> str:
         lines += ["", "Used most:"]
     for option in screen.used:
         found = re.search(rf"^  (?:-\w, )?--{re.escape(option)}(?:[ ,\n].*\n?)(?:   .*\n)*", text, re.MULTILINE)
-        assert found is not None, f"{prog} has no option --{option}"
-        lines += [line.rstrip() for line in found[0].splitlines()]
+        if found:  # a preset may lack a field
+            lines += [line.rstrip() for line in found[0].splitlines()]
     return "\n".join(lines)
 
 
@@ -269,12 +267,14 @@ def main_errors() -> Iterator[None]:
     with command.main_errors():
         _called.clear()
         yield
-        screen = FIRST_SCREENS.get(_called.get("name", ""))
+        screen = _screen(_called.get("prog", ""))
         if screen is None or not screen.following or not command.is_lead():
             return
         from rsjax.progress import duration
 
         following = screen.following.format(run=_called["run"])
+        if _called["showed"]:
+            following = f"the same command without {_called['showed']} does it"
         print(f"done in {duration(time.monotonic() - began)}; next: {following}", file=sys.stderr)
 
 
@@ -287,12 +287,24 @@ def _remember(prog: str, options: Any, run: Path | None = None) -> None:
         value = getattr(options, name, None)
         if run is None and value:
             run = value[0] if isinstance(value, tuple) else value
-    _called.update(name=_name(prog), run=str(run or "RUN"))
+    showed = next((f"--{_flag(name)}" for name in SHOWING if getattr(options, name, False)), "")
+    _called.update(prog=prog, run=str(run or "RUN"), showed=showed)
 
 
-def _name(prog: str) -> str:
-    """Returns the name of a command as the user types it: play, of ``rsjax play``."""
-    return [*prog.split(), "", ""][1]
+def _screen(prog: str) -> FirstScreen | None:
+    """Returns the first screen of a command as the user types it, such as ``rsjax play`` or ``rsjax store merge``."""
+    _, *words = prog.split() or [""]
+    return FIRST_SCREENS.get(" ".join(words[:2])) or FIRST_SCREENS.get(" ".join(words[:1]))
+
+
+def _show_help(parts: dict[str, Any], prog: str, description: str) -> NoReturn:
+    """Prints the help for these parts with the command's first screen, and stops."""
+    text = _help(parts, prog, description)
+    head, line, body = text.partition("\n positional arguments")
+    if not line:
+        head, line, body = text.partition("\n options")
+    print(f"{with_first_screen(head, prog, text)}\n{line}{body}", end="")
+    raise SystemExit(0)
 
 
 def _help(parts: dict[str, Any], prog: str, description: str) -> str:

@@ -13,7 +13,7 @@ class FirstScreen:
     Attributes:
         example: a line that works, apart from paths.
         output: where the results go.
-        used: the options that people use most, at most five, without dashes; none for a command with a handful.
+        used: the options that people use most, at most five, without dashes. A preset may lack one of them.
         following: what to do next, with {run} for the run or store that the command was called with; "" for a command
             that says it itself, or whose output says it.
         takes: how long it takes, where that was measured; "" where it depends on the data alone.
@@ -32,7 +32,7 @@ FIRST_SCREENS = {
     "demo": FirstScreen(
         "rsjax demo",
         "rsjax-demo/: a video and a picture (--out); with a display, a page in the browser",
-        ("video", "clip", "out", "port"),
+        ("video", "clip", "out", "port", "data-dir"),
     ),
     "play": FirstScreen(
         "rsjax play tiny",
@@ -44,6 +44,7 @@ FIRST_SCREENS = {
         "RUN/generated: a video for each clip (--out); its path is printed",
         ("clips", "frames", "actions-from", "format", "out"),
         "rsjax play {run} drives the same model; rsjax evaluate {run} scores it",
+        "four clips of tiny take about 10 seconds on 2 CPU cores",
     ),
     "train": FirstScreen(
         "rsjax train tiny --run-dir runs/mine",
@@ -73,7 +74,7 @@ FIRST_SCREENS = {
     "inspect": FirstScreen(
         "rsjax inspect data/pusht",
         "the terminal, and STORE-sheet.png beside the store (--sheet)",
-        ("records", "clips", "sheet", "rerun"),
+        ("records", "clips", "sheet", "rerun", "rerun-file"),
         "rsjax train tiny --store {run} --run-dir runs/mine trains on it",
     ),
     "store": FirstScreen(
@@ -81,6 +82,24 @@ FIRST_SCREENS = {
         "a new store: OUT of merge, the folder --into of split",
         (),
         "rsjax inspect STORE shows what is in it",
+    ),
+    "store merge": FirstScreen(
+        "rsjax store merge data/both data/one data/other",
+        "OUT, a new store; its path and the number of its clips are printed",
+        (),
+        "rsjax inspect OUT shows what is in it",
+    ),
+    "store split": FirstScreen(
+        "rsjax store split data/pusht --into data/parts --by task",
+        "new stores in the folder --into, one for each label or part; their paths are printed",
+        ("into", "by", "parts"),
+        "rsjax inspect STORE shows what is in one of them",
+    ),
+    "store tokenize": FirstScreen(
+        "rsjax store tokenize data/pusht --run runs/tiny",
+        "a store of tokens beside the clips; its path is printed",
+        ("run",),
+        "trainings that start from the same tokenizer find these tokens",
     ),
     "export": FirstScreen(
         "rsjax export lerobot data/pusht pusht-clips",
@@ -93,6 +112,7 @@ FIRST_SCREENS = {
         "RUN/evaluations: result.json for each protocol and split; its path is printed",
         ("protocol", "data", "clips", "horizon", "overwrite"),
         "rsjax compare {run} OTHER sets runs side by side; docs/evaluation.md says what the metrics mean",
+        "a run of tiny takes 2 to 4 minutes on 2 CPU cores, the model tiny in the package half a minute",
     ),
     "compare": FirstScreen(
         "rsjax compare runs/tiny runs/genie --protocol run",
@@ -126,7 +146,7 @@ FIRST_SCREENS = {
     "record": FirstScreen(
         "rsjax record runs/tiny --policies runs/tiny/policy_learning/real-200-seed0",
         "RUN/recorded (--out): a store of episodes",
-        ("policies", "episodes", "together", "out"),
+        ("policies", "episodes", "together", "data-dir", "out"),
         "rsjax train tiny with the line above trains on these episodes, too",
     ),
     "adapt": FirstScreen(
@@ -138,7 +158,7 @@ FIRST_SCREENS = {
     "judge": FirstScreen(
         "rsjax judge runs/tiny",
         "RUN/judge: the weights, and validation.json",
-        ("head", "steps", "store", "data-dir"),
+        ("head", "steps", "clips", "store", "data-dir"),
         "rsjax synthesize {run} --judge, rsjax improve {run} and rsjax serve {run} use it from now on",
     ),
     "synthesize": FirstScreen(
@@ -146,6 +166,7 @@ FIRST_SCREENS = {
         "RUN/synthetic (--out): a store, and LeRobotDatasets v3.0 and v2.1",
         ("demos", "noise", "judge", "store", "out"),
         "rsjax policy_learning {run} trains policies on them; docs/lerobot.md says how to train others",
+        "tiny generates about 12 demonstrations a second on 2 CPU cores; writing them is not counted",
     ),
     "policy_learning": FirstScreen(
         "rsjax policy_learning runs/tiny --counts 50 200",
@@ -186,10 +207,20 @@ FIRST_SCREENS = {
         "rsjax hub pull USER/NAME mine",
         "push: the repository USER/NAME of the hub; pull: the directory MODEL",
     ),
+    "hub push": FirstScreen(
+        "rsjax hub push mine USER/NAME --private",
+        "the repository USER/NAME of the hub; the address of the commit is printed",
+        ("private",),
+    ),
+    "hub pull": FirstScreen(
+        "rsjax hub pull USER/NAME mine",
+        "the directory MODEL; its path is printed",
+        ("revision",),
+    ),
     "describe": FirstScreen(
         "rsjax describe roboscape_s",
         "the terminal; --json prints the numbers as JSON",
-        ("json", "model.width", "model.blocks", "train.batch-size"),
+        ("json", "model", "model.width", "model.blocks", "train.batch-size"),
         "rsjax compile PRESET --target h100x8 says how fast it could be there; rsjax bench PRESET measures it here",
     ),
     "compile": FirstScreen(
