@@ -17,7 +17,7 @@ from rsjax.tools.commands.replay import Options
 from rsjax.tools.commands.store import ACTIONS as STORE
 
 NAMES = [name for group in COMMANDS.values() for name in group]
-PARTS = [f"{name} {word}" for name, words in {"hub": HUB, "store": STORE}.items() for word in words]
+PARTS = [*(f"hub {word}" for word in HUB), *(f"store {word}" for word in STORE)]
 PRESETS = [f"{name} tiny" for name in ("train", "ablation", "describe", "compile", "bench")]
 LINES = 36  # of a terminal, at a width of 100
 # Commands that take minutes or hours. demo, play and serve run until they are stopped.
