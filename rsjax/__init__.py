@@ -75,7 +75,13 @@ def open_store(path: "Path | str") -> "Store":
     return store.open_store(path)
 
 
-def write_store(path: "Path | str", clips: "Iterable[Mapping[str, Any] | Clip]", *, test_share: float = 0.1) -> "Store":
+def write_store(
+    path: "Path | str",
+    clips: "Iterable[Mapping[str, Any] | Clip]",
+    *,
+    test_share: float = 0.1,
+    generated: bool = False,
+) -> "Store":
     """Writes a store of clips, on which ``rsjax train PRESET --store PATH`` can train.
 
     Args:
@@ -96,6 +102,8 @@ def write_store(path: "Path | str", clips: "Iterable[Mapping[str, Any] | Clip]",
             Only ``rgb`` and ``actions`` are required.
         test_share: share of the episodes, chosen by a hash of their names, whose clips are the test split. With 0 the
             test split is empty, and ``rsjax train`` refuses to train a world model on the store.
+        generated: whether a world model made the clips, as ``model.generate`` does. Each clip's provenance then has the
+            source "generated", by which exports, ``rsjax detect`` and other tools tell it from a recording.
 
     Returns:
         The store, opened.
@@ -107,4 +115,4 @@ def write_store(path: "Path | str", clips: "Iterable[Mapping[str, Any] | Clip]",
     """
     from rsjax.data import build
 
-    return build.write_clips(path, clips, test_share)
+    return build.write_clips(path, clips, test_share, generated)

@@ -17,7 +17,7 @@ import numpy as np
 from array_record.python.array_record_module import ArrayRecordWriter
 from jaxtyping import Bool
 
-from rsjax.clip import UNKNOWN, Clip, words_of
+from rsjax.clip import GENERATED, UNKNOWN, Clip, words_of
 from rsjax.data.codec import Record, encode
 from rsjax.data.normalization import Statistics
 from rsjax.data.store import MANIFEST, WRITER_OPTIONS, Source, Store, StoreError, encode_clip, open_store, write_store
@@ -51,7 +51,9 @@ class _Episode:
             self.depth = [min(self.depth), max(self.depth)]
 
 
-def write_clips(path: Path | str, clips: Iterable[Mapping[str, Any] | Clip], test_share: float = 0.1) -> Store:
+def write_clips(
+    path: Path | str, clips: Iterable[Mapping[str, Any] | Clip], test_share: float = 0.1, generated: bool = False
+) -> Store:
     """Writes a store of clips, as :func:`rsjax.write_store` documents it."""
     path = checked_path(path, "path")
     try:
@@ -83,6 +85,8 @@ def write_clips(path: Path | str, clips: Iterable[Mapping[str, Any] | Clip], tes
             if not isinstance(given, Mapping):
                 raise StoreError(f"clip {count}: is a {type(given).__name__}, should be a dict with rgb and actions")
             record = _record(given, f"clip {count}", count)
+            if generated:
+                record["provenance"]["source"] = GENERATED
             shapes = {name: array.shape for name, array in record.items() if isinstance(array, np.ndarray)}
             for name, shape in shapes.items():
                 if name != "depth" and first.setdefault(name, shape) != shape:

@@ -66,6 +66,15 @@ def test_clips_of_the_dataclass_go_in_too(tmp_path: Path) -> None:
     np.testing.assert_array_equal(record["tracks"], toy.clip(int(original)).tracks)
 
 
+def test_generated_clips_are_marked_whatever_their_provenance_says(tmp_path: Path) -> None:
+    clips = [clip(0), clip(1, provenance={"source": "camera", "model": "mine"})]
+    for generated, sources in ((True, {"generated"}), (False, {"write_store", "camera"})):
+        store = rsjax.write_store(tmp_path / f"{generated}", clips, generated=generated)
+        made = [store.source(split)[0]["provenance"] for split in ("train", "test")]
+        assert {each["source"] for each in made} == sources
+        assert {each.get("model") for each in made} == {None, "mine"}
+
+
 @pytest.mark.parametrize("task", [None, float("nan"), "", " \n"])
 def test_no_task_is_unknown(tmp_path: Path, task: Any) -> None:
     store = rsjax.write_store(tmp_path / "mine", [clip(0, task=task, scene=task), clip(1, task=" push ")])

@@ -10,6 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
 from rsjax.clip import GENERATED_MARK, Video
 from rsjax.config import Config
@@ -148,7 +149,9 @@ def write_demo(model: Path, data_dir: Path, out: Path, number: int | None = None
     strip = video.with_suffix(".png")
     write_mp4(video, animation(figure), DEMO_FPS, comment=GENERATED_MARK)
     picture = io.BytesIO()
-    Image.fromarray(filmstrip(figure)).save(picture, "PNG")
+    mark = PngInfo()
+    mark.add_text("Comment", GENERATED_MARK)
+    Image.fromarray(filmstrip(figure)).save(picture, "PNG", pnginfo=mark)
     write_file(strip, picture.getvalue())
     return [video, strip]
 

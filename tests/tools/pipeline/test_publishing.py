@@ -102,6 +102,7 @@ def test_videos_the_demo_and_the_playground_work_from_the_directory_alone(publis
         assert len(list(container.decode(video=0))) == toy.config().sim.frames
     with Image.open(strip) as picture:
         assert min(picture.size) > 100
+        assert picture.info["Comment"] == GENERATED_MARK
     source = PlayRun(RunData(published, Path("nowhere"))).source
     assert source is not None
     outcomes = [bool(source[number]["success"][-1]) for number in range(2)]
