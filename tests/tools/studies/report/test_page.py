@@ -137,6 +137,14 @@ def test_tables_show_each_number_in_its_row(full_page):
     assert "episode <0>" in page.text
 
 
+def test_a_model_that_is_worse_than_the_first_frame_is_called_so_in_the_pages_first_line(tmp_path):
+    worse = {"psnr": 18.0, "psnr_repeat_first": 19.8, "psnr_motion": 11.0, "psnr_motion_repeat_first": 12.0}
+    write_report(tmp_path / "r.html", RunReport("debug", worse))
+    body = (tmp_path / "r.html").read_text().partition("<body>")[2]
+    first = re.sub(r"<[^>]*>", "", body).strip().partition("\n")[0]
+    assert first.startswith("Worse than repeating the first frame, also where it moves (PSNR 18.0 dB")
+
+
 def test_an_absent_metric_has_its_reason_as_a_footnote(tmp_path):
     weights = dict.fromkeys(("lpips_alex", "depth_absrel_median_estimator"), "no <weights>")
     report = RunReport(
