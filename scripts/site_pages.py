@@ -20,9 +20,6 @@ from pathlib import Path
 from typing import Any, get_args
 from unittest.mock import patch
 
-from mkdocs.structure.files import File, InclusionLevel
-from pymdownx.slugs import slugify
-
 from scripts.field_comments import fields_of, split_attributes
 
 ROOT = Path(__file__).parents[1]
@@ -58,6 +55,8 @@ _origins: dict[str, str] = {}  # the reverse
 
 def on_config(config: Any) -> Any:
     """Makes anchors as GitHub makes them, and adds the reference to the navigation."""
+    from pymdownx.slugs import slugify
+
     config["mdx_configs"]["toc"]["slugify"] = slugify(case="lower")
     sections = {next(iter(section)): next(iter(section.values())) for section in config["nav"]}
     reference = sections["Reference"]
@@ -75,9 +74,9 @@ def on_config(config: Any) -> Any:
 
 def on_files(files: Any, config: Any) -> Any:
     """Adds the made pages, and those of all files of the repository that pages link to."""
-    made = {f"reference/commands/{name}.md": command_page(name) for name in _commands()}
-    made |= {f"reference/config/{name}.md": config_page(name, module) for name, module in _config_modules().items()}
-    made |= {f"reference/api/{_name(title)}.md": module_page(title, modules) for title, modules in API.items()}
+    from mkdocs.structure.files import File, InclusionLevel  # only a build of the site has this package
+
+    made = reference_pages()
     own = {file.src_uri for file in files.documentation_pages()}
     waiting = [f"docs/{page}" for page in sorted(own)]
     for name in waiting:
@@ -156,6 +155,13 @@ def linked(name: str) -> list[str]:
             if (ROOT / target).exists() and not target.startswith(".."):
                 found.append(target)
     return found
+
+
+def reference_pages() -> dict[str, str]:
+    """Returns the pages of commands, configuration and Python API by their paths."""
+    made = {f"reference/commands/{name}.md": command_page(name) for name in _commands()}
+    made |= {f"reference/config/{name}.md": config_page(name, module) for name, module in _config_modules().items()}
+    return made | {f"reference/api/{_name(title)}.md": module_page(title, modules) for title, modules in API.items()}
 
 
 def repository_page(name: str) -> str:
