@@ -44,7 +44,7 @@ audit: setup  ## known vulnerabilities of the pinned packages, by PyPI's advisor
 	@scripts/audit.sh "$(VENV)"
 
 docs: setup  ## the documentation as a site, in site/; open site/index.html
-	@$(python) -c 'import mkdocstrings, material' 2>/dev/null || $(python) -m pip install --quiet --progress-bar off -c requirements.txt -r requirements-docs.txt
+	@scripts/docs.sh "$(VENV)"
 	@NO_MKDOCS_2_WARNING=1 $(python) -m mkdocs build --strict --quiet $(ARGS)
 
 clean:  ## removes the environment and the caches; data and runs stay

@@ -25,6 +25,11 @@ def targets() -> set[str]:
     return set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
 
 
+def made(script: str) -> list[str]:
+    """Returns the targets that a script makes."""
+    return re.findall(r"\bmake ([a-z-]+)", script)
+
+
 @pytest.mark.parametrize("path", YAML, ids=lambda path: path.name)
 def test_yaml_files_can_be_read(path: Path) -> None:
     assert load(path)
@@ -36,7 +41,7 @@ def test_workflows_call_targets_that_exist_and_pin_their_actions() -> None:
             assert "timeout-minutes" in job, f"{path.name}: {name}"
             for step in job["steps"]:
                 assert re.fullmatch(r"actions/[a-z-]+@v\d+", step.get("uses", "actions/checkout@v6"))
-                for target in re.findall(r"\bmake ([a-z-]+)", step.get("run", "")):
+                for target in made(step.get("run", "")):
                     assert target in targets(), f"{path.name}: make {target}"
 
 
@@ -44,6 +49,12 @@ def test_the_workflow_has_the_checks_that_a_change_must_pass() -> None:
     jobs = load(ROOT / ".github" / "workflows" / "ci.yml")["jobs"]
     assert {"lint", "test", "wheel", "docs"} <= jobs.keys()
     assert jobs["test"]["strategy"]["matrix"]["python"] == ["3.11", "3.12"]
+
+
+def test_the_local_run_checks_what_the_workflow_does() -> None:
+    jobs = load(ROOT / ".github" / "workflows" / "ci.yml")["jobs"]
+    wanted = {target for job in jobs.values() for step in job["steps"] for target in made(step.get("run", ""))}
+    assert {"lint", "test", "wheel-test", "docs"} <= wanted <= set(made((ROOT / ".ci" / "run").read_text()))
 
 
 def test_hooks_and_containers_use_what_is_there() -> None:
