@@ -112,7 +112,7 @@ def evaluate_run(directory: Path, data: Path, request: Request) -> Iterator[Path
         parts = [label(protocol, standard)]
         if split != "test":
             parts.append(split)
-        if request.data:
+        if request.data or saved:  # other clips than the run's, whose results may lie in the same place
             key = str(scored_store.manifest.get("key") or scored_store.path.absolute())
             parts.append(f"data={safe_id(key)}")  # a key may be unsafe as a path
         name = ",".join(parts)

@@ -18,6 +18,8 @@ from rsjax.evaluation.results import read_result
 from rsjax.model_directory import PRETRAINED, SHIPPED
 from rsjax.models.load_run import load_config
 from rsjax.tools.commands.evaluate import Options
+from rsjax.tools.pipeline.evaluations import Request as EvaluationRequest
+from rsjax.tools.pipeline.evaluations import evaluate_run
 from rsjax.tools.pipeline.provenance import record_start
 from rsjax.tools.pipeline.publishing import Publication, loss_of_rounding, predicted_psnr, publish
 from rsjax.tools.pipeline.run import Run
@@ -116,17 +118,22 @@ def test_videos_the_demo_and_the_playground_work_from_the_directory_alone(publis
     assert play.controls.width == toy.config().clips.action_dim
 
 
-def test_a_saved_model_is_evaluated_on_its_own_clips(published: Path, command: Commands, tmp_path: Path) -> None:
+def test_a_saved_model_is_evaluated_on_its_own_clips(
+    run: Run, published: Path, command: Commands, tmp_path: Path
+) -> None:
     saved = shutil.copytree(published, tmp_path / "saved")
     printed = command.here("experiments.evaluate", saved, "--protocol", "run")
     folder = Path(printed.split("result: ")[1].partition("\n")[0]).parent
-    assert folder == saved / "evaluations" / "run"
+    assert folder == saved / "evaluations" / "run,data=toy-2-of-test"
     result = read_result(folder)
     model = rsjax.load(published)
     clips = load_clips(Run(model.config, published, Path("nowhere")).open_clips(), 2)
     assert result.metrics["psnr"] == pytest.approx(predicted_psnr(model, clips).mean(), abs=0.01)
     assert "no training clips" in result.reasons["delta_psnr_uniform"]
     assert result.metrics["delta_psnr"] is not None
+    (whole,) = evaluate_run(saved, Path("nowhere"), EvaluationRequest("run", store=run.clips))
+    assert whole.name == "run,data=toy" and (saved / "coverage").exists()
+    assert read_result(whole).metrics["delta_psnr_uniform"] is not None
     assert Options((Path("tiny"),)).made_run == Path("runs/tiny")
 
 
