@@ -230,6 +230,16 @@ OPTIONS = {
     "play PLACE --no-browser": "not a run directory",
     "describe debug --train.seed -1": "train.seed is -1",
     "bench debug --train.seed -1": "train.seed is -1",
+    "train debug --run-dir PLACE/new --eval.action-draws 99999999": "lower --eval.clips, --eval.rep",
+    "train debug --run-dir PLACE/new --eval.clips 1": "clips is 1; it must be at least 2",
+    "train debug --eval.localiser-steps 99999999": "eval.localiser_steps is 99999999; it must be 1 … 100000",
+    "bench debug --only sample --batch 99999999": "--batch 99999999: so much at once takes more than",
+    "bench debug --only sample --horizons 99999999": "--horizons is 99999999; it can be at most 10,000",
+    "paper --preset debug --dry-run --seeds 99999999": "--seeds is 99999999; it must be 1 … 1000",
+    "plan PLACE/run --energy tokens --candidates 99999999": "--candidates 99999999 and --horizon 6: so much at once",
+    "plan PLACE/run --energy tokens --max-steps 99999999": "--max-steps is 99999999; it can be at most 10,000",
+    "plan PLACE/run --energy tokens --rounds 99999999": "--rounds is 99999999; it can be at most 1,000",
+    "synthesize PLACE/run --demos 99999999": "--demos is 99999999; it can be at most 1,000,000",
 }
 
 

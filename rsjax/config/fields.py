@@ -15,7 +15,11 @@ from rsjax.errors import UserError
 T = TypeVar("T")
 
 MOST = 10**9  # of a command's numbers other than seeds: that many of anything take years
-_MOST = f"it can be at most {MOST:,}"
+MOST_OF = {  # of a command's numbers with these names: more would take months, or all memory
+    **dict.fromkeys(("demos", "episodes", "held_out", "imagined", "rollouts", "trials"), 10**6),
+    **dict.fromkeys(("batch", "horizon", "horizons", "max_steps", "parts", "together"), 10**4),
+    **dict.fromkeys(("checkpoints", "rounds", "trainings"), 10**3),
+}
 MOST_SEED = 2**32 - 1  # jax.random.key drops higher bits, so two seeds would give the same draws
 
 
@@ -99,12 +103,20 @@ def check_numbers(settings: Any, prefix: str = "", dash: bool = False) -> None:
             elif isinstance(item, float):
                 finite = math.isfinite(item) or item == f.default  # a limit that is off may be infinite
                 require(finite, f"{name} is {item}; it must be a finite number")
-                require(not dash or not finite or abs(item) <= MOST or item == f.default, f"{name} is {item}; {_MOST}")
+                require(
+                    not dash or not finite or abs(item) <= MOST or item == f.default,
+                    f"{name} is {item}; {_at_most(MOST)}",
+                )
             elif isinstance(item, int) and f.name in ("seed", "seeds"):
                 require(0 <= item <= MOST_SEED, f"{name} is {item}; a seed is a whole number from 0 to {MOST_SEED}")
             elif isinstance(item, int):
                 require(abs(item) < 2**63, f"{name} is {item}; it must fit in 64 bits")
-                require(not dash or abs(item) <= MOST, f"{name} is {item}; {_MOST}")
+                most = MOST_OF.get(f.name, MOST)
+                require(not dash or abs(item) <= most, f"{name} is {item}; {_at_most(most)}")
+
+
+def _at_most(most: int) -> str:
+    return f"it can be at most {most:,}"
 
 
 def section_choices(hint: Any) -> dict[str, Any]:

@@ -46,8 +46,8 @@ class EvalConfig:
             "repetitions",
             "batch_size",
             "action_draws",
-            "localiser_steps",
         )
+        require_range(self, "eval", 1, 100_000, "localiser_steps")
         require(
             not self.depth_estimator.startswith(SIMULATOR) or self.simulator_steps > 0,
             f"eval.depth_estimator is {self.depth_estimator!r}; write {SIMULATOR} or {SIMULATOR}:steps=500",

@@ -16,6 +16,7 @@ from rsjax.errors import did_you_mean
 from rsjax.tools.bench import inputs, parts
 from rsjax.tools.bench.roofline import roofline
 from rsjax.tools.bench.timing import peak_memory_bytes
+from rsjax.tools.pipeline.limits import check_together
 
 PARTS = ("matmul", "train", "roofline", "sample", "tokenizer", "environment", "loader", "feed")
 MODEL_FACTS = ("blocks", "width", "depth", "compute_dtype", "remat")  # reported if the family has them
@@ -49,7 +50,8 @@ def bench(
         Numbers and facts about model and machine, flat and JSON-ready. Peak memory is the maximum up to a part's end.
 
     Raises:
-        UserError: a part is unknown, the batch is not positive, or a rollout has nothing to generate.
+        UserError: a part is unknown, the batch is not positive or does not fit into memory, or a rollout has nothing
+            to generate.
     """
     check_request(config, batch, only, horizons)
     with inputs.random_files(config) as config:
@@ -113,6 +115,7 @@ def check_request(config: Config, batch: int, only: Sequence[str], horizons: Seq
     for frames in horizons:
         problem = f"--horizons has {frames}; a rollout has {parts.PROMPT_FRAMES} prompt frame, so it needs at least 2"
         require(frames > parts.PROMPT_FRAMES, problem)
+    check_together(config, batch, config.clips.frames, f"--batch {batch}")
 
 
 def ratios(numbers: dict[str, Any], dual: bool) -> dict[str, Any]:

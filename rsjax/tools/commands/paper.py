@@ -10,6 +10,7 @@ from rsjax.config import SIMULATOR, presets, require
 from rsjax.config.config_fields import with_values
 from rsjax.runtime import tune_process
 from rsjax.tools.commands.cli import main_errors, parse_options
+from rsjax.tools.studies.ablation.grid import MOST_SEEDS
 
 PROG = "rsjax paper"
 FILES = ("weights", "depth_estimator")  # fields of EvalConfig
@@ -57,7 +58,7 @@ def main() -> None:
     """Runs what has not finished, and prints the report's path; exits with 1 if a training failed."""
     tune_process()
     options = parse_options(sys.argv[1:], PROG, Options.__doc__ or "", Options())
-    require(options.seeds >= 1, f"--seeds is {options.seeds}; it must be at least 1")
+    require(1 <= options.seeds <= MOST_SEEDS, f"--seeds is {options.seeds}; it must be 1 … {MOST_SEEDS}")
     require(options.first_seed >= 0, f"--first-seed is {options.first_seed}; it must be at least 0")
     given = {f"eval.{name}": getattr(options, name) for name in FILES if getattr(options, name)}
     preset = with_values(presets.get(options.preset), given)

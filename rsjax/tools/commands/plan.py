@@ -53,6 +53,7 @@ def main() -> None:
     tune_process()
     options = parse_options(sys.argv[1:], "rsjax plan", Options.__doc__ or "", Options())
     from rsjax.models.load_run import load
+    from rsjax.tools.pipeline.limits import check_together
     from rsjax.tools.policies.planning.closed_loop import PlanSettings, compare, folder, results_text
     from rsjax.tools.policies.planning.planner import PlannerConfig
     from rsjax.tools.policies.policy import load_policy
@@ -63,6 +64,8 @@ def main() -> None:
     limits = (options.episodes, options.max_steps, options.warm_start)
     settings = PlanSettings(planner, options.methods, options.energy, options.lpips_weights, *limits)
     trained = load(options.run)
+    at_once = f"--candidates {options.candidates} and --horizon {options.horizon}"
+    check_together(trained.config, options.candidates, options.horizon, at_once)
     policies: dict[str, Any] = {}
     if options.policy:
         policies[f"policy {options.policy}"] = load_policy(options.policy)

@@ -35,6 +35,7 @@ def main() -> None:
     from rsjax.data.store import open_store
     from rsjax.model_directory import locate, output_directory
     from rsjax.progress import Progress
+    from rsjax.tools.pipeline.limits import check_together
     from rsjax.tools.policies.run_data import RunData, with_clips
     from rsjax.tools.policies.studies.synthesis import synthesize
     from rsjax.tools.policies.worlds.actions import action_range
@@ -42,6 +43,7 @@ def main() -> None:
     if not options.store:
         with_clips(options.run, ", or a store of clips with --store")
     run = RunData(locate(options.run), options.data_dir)
+    check_together(run.config, options.batch, run.config.clips.frames, f"--batch {options.batch}")
     out = options.out or output_directory(run.run, "synthetic")
     store = open_store(options.store) if options.store else run.clips
     limits = action_range(run.config, run.trained.assets.normalization)

@@ -206,7 +206,7 @@ def quaternions(rows: Float[np.ndarray, "N n"]) -> list[int]:
 
 def _sample(count: int, frames: int) -> list[int]:
     """Spreads ``frames`` indices evenly over ``count``, including the first and the last; 0 means all."""
-    if not frames:
+    if not frames or frames >= count:
         return list(range(count))
     return np.unique(np.linspace(0, count - 1, frames).astype(int)).tolist()
 

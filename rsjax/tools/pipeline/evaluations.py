@@ -19,7 +19,7 @@ from rsjax.evaluation import evaluate as evaluation
 from rsjax.evaluation.coverage import make_coverage
 from rsjax.evaluation.evaluate import EvaluationClips
 from rsjax.evaluation.metrics.physics_iq import THRESHOLD
-from rsjax.evaluation.protocols import Protocol, find, label, of_run
+from rsjax.evaluation.protocols import Protocol, check, find, label, of_run
 from rsjax.evaluation.results import NAME, Evaluation, fingerprint, read_result, result_of, write_result
 from rsjax.files import FileError, disk_guard, making, safe_id
 from rsjax.model_directory import is_saved, output_directory
@@ -38,7 +38,7 @@ from rsjax.tools.sim import probes, retakes
 from rsjax.training.distributed import barrier, is_lead, on_lead
 
 FOLDER = "evaluations"
-MOST_FRAMES = 1_000_000  # of all clips of an evaluation
+MOST_FRAMES = 10_000_000  # generated for an evaluation; the authors' 1,200 clips, five times, of 48 frames: 2 million
 NOT_OF_METRICS = ("clips", "repetitions", "action_draws", "batch_size")
 
 
@@ -93,6 +93,8 @@ def evaluate_run(directory: Path, data: Path, request: Request) -> Iterator[Path
     standard = find(request.protocol, config)
     protocol = replace(standard, **request.changes, splits=request.splits or standard.splits)
     check_request(config, protocol)
+    resolution = config.clips.image_size
+    check(protocol, protocol.prompt_frames + max(protocol.horizon, 1), resolution, str(directory))
     trained = replace(load(directory), config=config)
     sampling = getattr(config.model, "sample", None)
     known = {each.name for each in fields(sampling)} if is_dataclass(sampling) else set()
@@ -130,23 +132,34 @@ def check_request(config: Config, protocol: Protocol) -> None:
 
     Raises:
         UserError: the depth scores in tables need an estimator, and there is none; or the clips would not fit into
-            memory, or take days to simulate.
+            memory, or take days to simulate and generate.
     """
     if protocol.depth_source == "estimator" and not config.eval.depth_estimator:
         raise UserError(
             "--depth-source estimator needs a network that estimates depth: set --eval.depth-estimator "
             "(docs/evaluation.md), or --depth-source branch"
         )
+    check_generated(
+        config, protocol, "lower --clips, --prompt-frames, --horizon, --samples, --repetitions or --action-draws"
+    )
     frames = protocol.prompt_frames + protocol.horizon
-    what = f"protocol {protocol.name}: {protocol.clips} clips of {frames} frames"
-    cure = "lower --prompt-frames, --horizon or --clips"
-    if protocol.clips * frames > MOST_FRAMES:
-        raise UserError(f"{what} are more than {MOST_FRAMES:,}, which take days to simulate and generate; {cure}")
     needed = protocol.clips * frames * config.clips.image_size**2 * (3 + 4 * config.model.uses_depth)
     there = host_memory()
     if needed > there:
         raise UserError(
-            f"{what} take {needed / GIB:,.0f} GiB; this machine has {there / GIB:,.0f} GiB of memory; {cure}"
+            f"protocol {protocol.name}: {protocol.clips} clips of {frames} frames take {needed / GIB:,.0f} GiB; this "
+            f"machine has {there / GIB:,.0f} GiB of memory; lower --prompt-frames, --horizon or --clips"
+        )
+
+
+def check_generated(config: Config, protocol: Protocol, cure: str) -> None:
+    """Raises :class:`UserError` if an evaluation generates more than ``MOST_FRAMES``; ``cure`` says what to lower."""
+    frames = protocol.prompt_frames + (protocol.horizon or config.clips.frames - protocol.prompt_frames)
+    videos = protocol.repetitions * (protocol.samples + 2 * protocol.action_draws)
+    if protocol.clips * videos * frames > MOST_FRAMES:
+        raise UserError(
+            f"protocol {protocol.name}: {protocol.clips} clips of {frames} frames, each generated {videos} times, are "
+            f"more than {MOST_FRAMES:,} frames, which take days; {cure}"
         )
 
 

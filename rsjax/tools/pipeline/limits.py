@@ -34,10 +34,8 @@ def device_memory() -> int:
 def check_batch(config: Config, loop: TrainConfig, stage: Literal["tokenizer", "world_model"]) -> None:
     """Raises :class:`UserError` if a batch's activations cannot fit into the devices' memory."""
     # At least so many bytes a clip for the backward pass: features of one layer, or inputs of blocks.
-    if stage == "world_model" and isinstance(config.model, TransformerConfig):
-        clip_bytes = 2 * config.model.blocks * config.clips.frames * config.grid**2 * config.model.width
-    elif stage == "world_model":
-        clip_bytes = config.clips.frames * config.clips.image_size**2
+    if stage == "world_model":
+        clip_bytes = config.clips.frames * _frame_bytes(config)
     elif config.autoencoder is config.tokenizer:
         cells = (config.clips.image_size // config.tokenizer.patch_size) ** 2
         clip_bytes = 2 * config.tokenizer_train.frames_per_clip * cells * config.tokenizer.channels
@@ -55,6 +53,30 @@ def check_batch(config: Config, loop: TrainConfig, stage: Literal["tokenizer", "
         )
 
 
+def _frame_bytes(config: Config) -> int:
+    """Returns bytes that a world model needs for each frame: the inputs of its blocks, or at least the picture."""
+    if isinstance(config.model, TransformerConfig):
+        return 2 * config.model.blocks * config.grid**2 * config.model.width
+    return config.clips.image_size**2
+
+
+def check_together(config: Config, clips: int, frames: int, options: str) -> None:
+    """Raises :class:`UserError` if a world model cannot hold so many clips of so many frames in memory at once.
+
+    A generated clip that is longer than those of the training takes the memory of its window.
+
+    Args:
+        options: the options that say so, with their values.
+    """
+    needed = clips * min(frames, config.clips.frames) * _frame_bytes(config)
+    there = device_memory()
+    if needed > there:
+        raise UserError(
+            f"{options}: so much at once takes more than {needed / GIB:,.0f} GiB on a device with "
+            f"{there / GIB:,.0f} GiB; lower it"
+        )
+
+
 def check_rollout(config: Config, frames: int) -> None:
     """Raises :class:`UserError` if a generated video of one clip cannot fit into memory."""
     pixel_bytes = 3 + 4 * config.model.uses_depth
@@ -67,13 +89,13 @@ def check_rollout(config: Config, frames: int) -> None:
         )
 
 
-def check_episodes(config: SimConfig, out: Path) -> None:
+def check_episodes(config: SimConfig, out: Path, option: str = "sim.episodes") -> None:
     """Raises :class:`UserError` if simulated episodes cannot fit onto the disk, at one byte per pixel or more."""
     place = next(folder for folder in (out, *out.absolute().parents) if folder.exists())
     needed = config.episodes * config.frames * config.image_size**2
     free = shutil.disk_usage(place).free
     if needed > free:
         raise UserError(
-            f"sim.episodes is {config.episodes}, which takes more than {needed / GIB:,.0f} GiB; {place} has "
+            f"{option} is {config.episodes}, which takes more than {needed / GIB:,.0f} GiB; {place} has "
             f"{free / GIB:,.0f} GiB free; lower it, or choose another --data-dir"
         )

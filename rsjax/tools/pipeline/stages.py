@@ -10,6 +10,7 @@ from rsjax.data.quarantine import NAME as QUARANTINE
 from rsjax.data.store import Store
 from rsjax.errors import UserError
 from rsjax.evaluation.metrics.lpips import advice
+from rsjax.evaluation.protocols import of_run
 from rsjax.evaluation.results import save_evaluation
 from rsjax.files import disk_guard
 from rsjax.model_directory import Part, load_part, locate
@@ -18,7 +19,7 @@ from rsjax.models.load_run import load_tokenizer
 from rsjax.progress import Progress, duration, note, stage
 from rsjax.tools.pipeline.depth_stage import check_depth, make_depth_network
 from rsjax.tools.pipeline.estimated_annotations import with_estimates
-from rsjax.tools.pipeline.evaluations import evaluate_own
+from rsjax.tools.pipeline.evaluations import check_generated, evaluate_own
 from rsjax.tools.pipeline.limits import check_batch, check_episodes
 from rsjax.tools.pipeline.metric_files import check_metric_files
 from rsjax.tools.pipeline.provenance import record_data, record_start
@@ -112,6 +113,7 @@ def check_before_start(run: Run) -> None:
     if "world_model" in run.stages and not run.finished("world_model"):
         create_model(cfg).check_files()
     if not run.finished("evaluation"):
+        check_generated(cfg, of_run(cfg), "lower --eval.clips, --eval.repetitions or --eval.action-draws")
         check_metric_files(cfg.eval)
         check_depth(run)
 

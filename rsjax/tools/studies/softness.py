@@ -33,6 +33,7 @@ from rsjax.progress import Progress
 from rsjax.runtime import tune_process
 from rsjax.tools.commands.cli import main_errors, parse_options
 from rsjax.tools.logistic_regression import fit
+from rsjax.tools.pipeline.limits import check_episodes
 from rsjax.tools.sim.collect import collect, collection_key
 from rsjax.tools.studies.tables import Table, as_markdown
 
@@ -221,6 +222,7 @@ def main() -> None:
     trained = rsjax.load(options.run)
     sim = episodes_like(trained.config.sim, options.episodes)
     out = options.data_dir / f"rope-{collection_key(sim)}"
+    check_episodes(sim, out, "--episodes")
     with Progress("collect", sim.episodes, "episodes") as progress:
         collect(sim, out, lambda done, total: progress.update(done))
     store = open_store(out)

@@ -276,6 +276,9 @@ def test_a_protocol_changes_the_settings_of_sampling(run: Run) -> None:
 def test_a_full_size_preset_raises_the_clips_but_not_those_of_several_samples() -> None:
     full_size = presets.get("ivideogpt_64")
     assert [find(name, full_size).clips for name in ("paper", "ivideogpt-bair")] == [1200, 256]
+    longest = find("horizon48", replace(presets.tiny(), eval=full_size.eval))
+    assert (longest.clips, longest.repetitions) == (1200, 5)
+    evaluations.check_request(presets.tiny(), longest)
 
 
 def test_a_comparison_of_a_run_with_itself(
@@ -298,8 +301,15 @@ def test_a_comparison_of_a_run_with_itself(
         (Request("unseen", CHANGES), r"no split 'unseen\*'; it has train, test"),
         (Request("paper", CHANGES, data=Path("nowhere")), "nowhere: not there"),
         (Request("paper", CHANGES | {"depth_source": "estimator"}), "estimator needs a network .* --eval.depth-estim"),
-        (Request("paper", CHANGES | {"prompt_frames": 10**9}), "clips of 1000000005 frames are more than 1,000,00"),
+        (
+            Request("paper", CHANGES | {"prompt_frames": 10**9}),
+            "clips of 1000000005 frames, each generated .* are more",
+        ),
+        (Request("paper", CHANGES | {"samples": 9_999_999}), "each generated .* lower --clips, .* --samples, "),
+        (Request("paper", CHANGES | {"repetitions": 9_999_999}), "each generated .* --repetitions or --action-draws"),
+        (Request("paper", CHANGES | {"action_draws": 9_999_999}), "each generated .* --repetitions or --action-draws"),
         (Request("paper", CHANGES | {"steps": 999_999}), r"steps is 999999, but a frame has \d+ cells"),
+        (Request("paper", {"resolution": 999}), "scores frames of 999 pixels per side; those of .*run have"),
         (Request("paper", CHANGES | {"resolution": 1}), "resolution is 1; frames have at least 16 pixels"),
         (Request("paper", CHANGES, {"weights": "nowhere"}), "eval.weights is nowhere: no such directory"),
     ],

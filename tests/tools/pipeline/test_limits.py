@@ -8,7 +8,15 @@ import pytest
 from rsjax.config import Config, ConfigError, TrainConfig, presets
 from rsjax.errors import UserError
 from rsjax.tools.pipeline import limits
-from rsjax.tools.pipeline.limits import GIB, check_batch, check_episodes, check_rollout, device_memory, host_memory
+from rsjax.tools.pipeline.limits import (
+    GIB,
+    check_batch,
+    check_episodes,
+    check_rollout,
+    check_together,
+    device_memory,
+    host_memory,
+)
 from tests.models.toy_family import ToyConfig
 
 TINY = presets.tiny()
@@ -42,6 +50,14 @@ def test_no_preset_is_refused_on_its_accelerator(name: str, monkeypatch: pytest.
     check_batch(config, config.train, "world_model")
     if config.model.uses_tokenizer:
         check_batch(config, config.tokenizer_train, "tokenizer")
+
+
+def test_clips_at_once_beyond_memory_are_refused_and_longer_ones_take_that_of_their_window() -> None:
+    check_together(TINY, 100, 10**6, "--batch 100")
+    for config in (TINY, replace(TINY, model=ToyConfig())):
+        with pytest.raises(UserError) as error:
+            check_together(config, 10**8, 6, "--candidates 100000000")
+        assert "--candidates 100000000: so much at once takes more than" in str(error.value)
 
 
 def test_a_rollout_beyond_memory_is_refused() -> None:

@@ -40,6 +40,7 @@ SWITCHES = {  # a field → the switch that is "none" where the field has no eff
     "model.loss.num_keypoints": "model.loss.keypoints",
 }
 SEED = "train.seed"
+MOST_SEEDS = 1000
 OTHER_SEEDS = ("tokenizer_train.seed", "sim.seed")  # what a seed of everything decides too: the tokenizer, the clips
 FILE = "grid.json"
 LIBRARIES = ("rsjax", "jax", "flax", "optax", "numpy")  # libraries whose versions the file records
@@ -191,9 +192,10 @@ def make_grid(
     """Returns the cells of these combinations. The seed changes slowest, so a stopped grid has complete tables.
 
     Raises:
-        ConfigError: there is no seed, or a seed is repeated or outside [0, 2³²); or some cells cannot run, and the
-            message names the first of them.
+        ConfigError: there is no seed or too many, or one is repeated or outside [0, 2³²); or some cells cannot run, and
+            the message names the first of them.
     """
+    require(len(seeds) <= MOST_SEEDS, f"--seeds: {len(seeds):,} of them; name {MOST_SEEDS:,} at most")
     flag = f"--seeds {' '.join(map(str, seeds))}"
     require(0 < len(seeds) == len(set(seeds)), f"{flag}: name one or more, each once")
     require(all(0 <= seed < 2**32 for seed in seeds), f"{flag}: a seed lies between 0 and 2^32 - 1")

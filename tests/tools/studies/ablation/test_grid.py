@@ -79,6 +79,12 @@ def test_names_that_had_to_be_changed_stay_apart() -> None:
     )
 
 
+def test_more_than_a_thousand_seeds_are_refused() -> None:
+    with pytest.raises(ConfigError) as error:
+        expand(DEBUG, {}, range(1001))
+    assert str(error.value) == "--seeds: 1,001 of them; name 1,000 at most"
+
+
 def test_without_axes_there_is_a_cell_per_seed() -> None:
     assert list(toy.grid(seeds=(4, 2)).cells) == ["seed=4", "seed=2"]
 
