@@ -51,7 +51,7 @@ def written(folder: Path, tensors: Tensors, settings: dict[str, Any] | None) -> 
 
 
 def test_both_networks_come_back_to_the_bit(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    config = replace(NET, learned_positions=(3, 2, 2))
+    config = replace(NET, learned_positions=(3, 2, 5))
     tensors = transformer(config)
     (vae, settings) = autoencoder()
     convert("cogvideox", written(tmp_path / "a", tensors, cogvideox.transformer_settings(config)), tmp_path / "own")
@@ -81,7 +81,7 @@ def test_both_networks_come_back_to_the_bit(tmp_path: Path, capsys: pytest.Captu
     plain: Any = create_model(toy.config())
     assert "learned_positions" in plain.pretrained_shapes(tmp_path / "own")
     fits = toy.config(learned_positions=(3, 4, 4))
-    with pytest.raises(UserError, match="model.learned_positions is .3, 2, 2. there, .3, 4, 4. here"):
+    with pytest.raises(UserError, match="model.learned_positions is .3, 2, 5. there, .3, 4, 4. here"):
         create_model(fits).pretrained_shapes(tmp_path / "own")
 
 

@@ -126,6 +126,18 @@ def test_weights_that_do_not_fit_are_named_as_in_the_file(key: str, value: np.nd
         from_public(Path("file"), tensors() | {key: value}, SETTINGS, names=names)
 
 
+@pytest.mark.parametrize("settings", [{}, {"S": 6}], ids=str)
+def test_frames_that_are_not_square_are_one_line(settings: dict[str, Any]) -> None:
+    beside = {name: value for name, value in SETTINGS.items() if name != "S"} | settings
+    wide = random_tensors(genie_shapes(LAYERS, WIDTH, HEADS, FRAMES, 6, CODES, False))
+    with pytest.raises(ConvertError) as error:
+        from_public(Path("file"), wide, beside)
+    assert str(error.value) == (
+        "file: its tensors do not fit the network inferred from them; of another shape: pos_embed_TSC is "
+        "(1, 3, 6, 16), not (1, 3, 4, 16)"
+    )
+
+
 def test_settings_of_training_are_ignored() -> None:
     more = SETTINGS | {"max_corrupt_rate": 0.3, "attn_drop": 0.1, "factored_vocab_size": None, "qkv_bias": None}
     assert infer_config(Path("file"), tensors(), more) == infer_config(Path("file"), tensors(), SETTINGS)
