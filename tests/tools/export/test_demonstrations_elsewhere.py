@@ -70,10 +70,10 @@ def test_a_policy_of_lerobot_takes_a_training_step(gl: str, tmp_path: Path) -> N
 
 
 def test_openpi_reads_them_by_its_configuration_of_libero(gl: str, tmp_path: Path) -> None:
-    """openpi's own transforms, up to its tokenizer, which it would download."""
+    """openpi's own transforms, with the keys of its LeRobotLiberoDataConfig, up to its tokenizer, a download."""
     libero_policy = pytest.importorskip("openpi.policies.libero_policy", reason="openpi is not installed")
     from openpi.models.model import ModelType
-    from openpi.transforms import RepackTransform
+    from openpi.transforms import PromptFromLeRobotTask, RepackTransform
 
     item = opened(tmp_path)[0]
     keys = {
@@ -81,8 +81,10 @@ def test_openpi_reads_them_by_its_configuration_of_libero(gl: str, tmp_path: Pat
         "observation/wrist_image": "wrist_image",
         "observation/state": "state",
         "actions": "actions",
-        "prompt": "task",
+        "prompt": "prompt",
     }
-    inputs = libero_policy.LiberoInputs(model_type=ModelType.PI0)(RepackTransform(keys)(item))
+    asked = PromptFromLeRobotTask({int(item["task_index"]): item["task"]})(item)
+    inputs = libero_policy.LiberoInputs(model_type=ModelType.PI0)(RepackTransform(keys)(asked))
+    assert inputs["prompt"] == item["task"]
     assert inputs["image"]["base_0_rgb"].shape == inputs["image"]["left_wrist_0_rgb"].shape == (64, 64, 3)
     assert inputs["actions"].shape == (HORIZON, 7)
