@@ -9,7 +9,7 @@ from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 Kind = Literal["refused", "ended", "began", "broke", "unclear"]
 GOOD = ("clear line", "harmless", "documented")
@@ -91,7 +91,7 @@ def command(words: Sequence[str], place: Place) -> Ended:
     sys.argv = [f"rsjax {name}", *filled[1:]]
     try:
         with redirect_stdout(out), redirect_stderr(errors):
-            import_module(f"rsjax.tools.commands.{name}").main()
+            module_of(name).main()
         status = 0
     except SystemExit as stop:
         status = stop.code if isinstance(stop.code, int) else int(stop.code is not None)
@@ -110,6 +110,11 @@ def command(words: Sequence[str], place: Place) -> Ended:
     if status in (0, 1) and not lines:  # with 1, doctor and inspect report damage in their own words
         return Ended("ended" if status == 0 else "refused", out.getvalue()[:LONGEST_LINE].replace("\n", " "))
     return Ended("unclear", f"exit status {status}: {said}")
+
+
+def module_of(name: str) -> Any:
+    """Returns the module of a command, or of a study that has no command."""
+    return import_module("rsjax.tools.studies.softness" if name == "softness" else f"rsjax.tools.commands.{name}")
 
 
 def fill(word: str, place: Place) -> str:

@@ -7,7 +7,7 @@ from typing import Any
 
 import tyro
 
-from benchmarks.hostile.cases import Case, Ended, Place, command
+from benchmarks.hostile.cases import Case, Ended, Place, command, module_of
 from benchmarks.hostile.values import Absurd, absurd_values
 from rsjax.config import presets
 from rsjax.config.config_fields import config_fields
@@ -29,6 +29,7 @@ LINES = {
     "store split": "store split MATERIAL/store --into NEW",
     "store tokenize": "store tokenize MATERIAL/other --run MATERIAL/run",
     "export": "export lerobot MATERIAL/store NEW --codec h264",
+    "export libero": "export libero NEW",
     "evaluate": f"evaluate {RUN} --overwrite",
     "compare": "compare MATERIAL/run --out NEW",
     "ablation": "ablation debug --data-dir MATERIAL/data --out NEW",
@@ -53,6 +54,7 @@ LINES = {
     "bench": "bench debug --only matmul",
     "convert": "convert genie MATERIAL/file NEW",
     "replay": f"replay {RUN}",
+    "softness": f"softness {RUN}",
 }
 # Words of the error with which a line itself ends on the material, or on a machine without an optional package.
 OWN_END = {
@@ -61,6 +63,7 @@ OWN_END = {
     "hub push": "huggingface_hub",
     "hub pull": "huggingface_hub",
     "compile": "compiler",
+    "convert": "unknown kind of file",
 }
 
 # Paths in the place of the first path of a line that are none, or of something else.
@@ -153,6 +156,28 @@ DOCUMENTED: tuple[tuple[str, str, str, str], ...] = (
     ("policy_evaluation", "imagined", "0", "four times --episodes, the default"),
     ("policy_evaluation", "judge_with", "", "off, the default"),
     ("*", "path", "a saved model", "a saved model is a model"),
+    ("softness", "data_dir", "*", "the directory of data sets is made when the first is"),
+    ("export libero", "crf", "0", "without loss"),
+    ("export libero", "seed", "*", "a seed"),
+    ("*", "seed", "99999999", "a seed"),
+    ("ablation", "seeds", "99999999", "a seed"),
+    ("paper", "first_seed", "99999999", "a seed"),
+    ("*", "split_seed", "99999999", "a seed"),
+    ("*", "steps", "99999999", "a long training, which shows its time and goes on where it was stopped"),
+    ("*", "train_steps", "99999999", "a long training, as above"),
+    ("*", "tokenizer_steps", "99999999", "a long training, as above"),
+    ("finetune", "patience", "99999999", "never ends early"),
+    ("*", "eval.batch_size", "99999999", "all clips at once"),
+    ("train", "eval.batch_size", "99999999999", "all clips at once"),
+    ("generate", "top_k", "99999999", "all codes"),
+    ("ingest", "windows.hop", "99999999", "one window of each episode"),
+    ("judge", "clips", "99999999", "all clips"),
+    ("judge", "reconstructed", "99999999", "all clips"),
+    ("judge", "generated", "99999999", "all clips"),
+    ("judge", "validation_clips", "99999999", "all clips"),
+    ("save", "clips", "99999999", "all clips"),
+    ("save", "measured", "99999999", "all clips"),
+    ("*", "videos", "99999999", "of all episodes"),
 )
 
 
@@ -168,7 +193,10 @@ def cases() -> Iterator[Case]:
         yield Case(f"options: {name}, an option without its value", _running(LINES[name], "--data-dir"), ())
         yield from _paths(name)
     for field, entry in config_fields(presets.get("debug")).items():
-        for absurd in absurd_values(field.rpartition(".")[2], entry.kind)[:8]:
+        absurd_ones = absurd_values(field.rpartition(".")[2], entry.kind)
+        if not field.startswith("eval."):
+            absurd_ones = absurd_ones[:8]  # what is absurd for every number
+        for absurd in absurd_ones:
             yield _case("fields", "train", LINES["train"], field, absurd)
 
 
@@ -197,10 +225,10 @@ def _paths(name: str) -> Iterator[Case]:
 
 
 def _options(name: str) -> Any:
-    from importlib import import_module
-
     command_name, _, word = name.partition(" ")
-    module = import_module(f"rsjax.tools.commands.{command_name}")
+    module = module_of(command_name)
+    if name == "export libero":
+        return module.LiberoOptions()
     if word:
         return module.ACTIONS[word][0]
     if command_name == "ingest":

@@ -23,6 +23,7 @@ WHOLE = (
     Absurd("-1", False),
     Absurd("0", False),
     Absurd("99999999999", False),
+    Absurd("99999999", False),  # below the limit of every number
 )
 REAL = (*NUMBERS, *map(Absurd, ("inf", "-inf")), Absurd("-1", False), Absurd("0", False), Absurd("1e30", False))
 TEXTS = tuple(Absurd(word, False) for word in ("", "x" * 100_000, "\x1b[31m\n", "\udcff", "../../etc", "²"))

@@ -23,6 +23,7 @@ WORK = (
     "rsjax.training.loop:fit",
     "rsjax.tools.sim.collect:collect",
     "rsjax.tools.sim.collect:make_store",
+    "rsjax.tools.export.demonstrations:TabletopSim",
     "rsjax.tools.finetune.recipe:measure_tokenizer",
     "rsjax.tools.policies.worlds.simulator_world:SimulatorWorld.lift",
     "rsjax.tools.policies.judges.trained_judge:train_judge",
