@@ -1,6 +1,8 @@
 """The world model as an environment: the frames of ``generate``, Gymnasium's rules, and errors that name shapes."""
 
+import os
 import shutil
+import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -29,6 +31,27 @@ from tests.models.toy_family import ToyConfig
 from tests.tools.pipeline import toy
 
 STEPS = 9  # the window is 6 frames
+ROOT = Path(__file__).parents[4]
+# A program that makes an episode begin, and prints how many programs it compiled and how many it read.
+STARTING = """
+import sys
+from pathlib import Path
+
+import jax
+
+events = []
+jax.monitoring.register_event_listener(lambda event, **_: events.append(event))
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+from rsjax.data.store import open_store
+from rsjax.tools.policies.worlds.environments import WorldModelEnv
+from tests.tools.pipeline import toy
+
+clips = open_store(Path(sys.argv[1]))
+env = WorldModelEnv(toy.trained(clips), data_dir=clips.path.parent)
+env.reset(seed=0)
+env.step(env.action_space.sample())
+print(*(events.count(f"/jax/compilation_cache/cache_{kind}") for kind in ("misses", "hits")))
+"""
 
 
 @pytest.fixture(scope="module")
@@ -303,6 +326,19 @@ def test_a_vec_env_restarts_in_the_step_that_ends_an_episode(
     assert "pip install stable-baselines3" in str(raised.value)
 
 
+def test_a_second_process_begins_with_the_compiled_programs_of_the_first(clips: Store, tmp_path: Path) -> None:
+    counts = []
+    for seed in ("1", "2"):
+        environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(tmp_path), "PYTHONHASHSEED": seed}
+        line = [sys.executable, "-c", STARTING, str(clips.path)]
+        done = subprocess.run(line, cwd=ROOT, env=environment, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        counts.append([int(word) for word in done.stdout.split()])
+    compiled = counts[0][0]
+    assert compiled > 3
+    assert counts == [[compiled, 0], [0, compiled]]
+
+
 def test_an_answer_that_is_no_judges_is_refused(model: TrainedModel, clips: Store) -> None:
     for answer in (None, "yes", np.zeros((1, 2)), np.full((1, 3), np.nan), [[1], [1, 2]]):
         judged = WorldModelEnv(model, data_dir=clips.path.parent, judge=lambda frames, answer=answer: answer)
@@ -313,11 +349,13 @@ def test_an_answer_that_is_no_judges_is_refused(model: TrainedModel, clips: Stor
 
 def test_somebody_elses_agent_learns_in_it(env: WorldModelEnv) -> None:
     agents = pytest.importorskip("stable_baselines3", reason="it is in requirements-extras.txt (make extras)")
-    agent = agents.PPO("MultiInputPolicy", env, n_steps=4, batch_size=4, n_epochs=1, seed=0)
-    agent.learn(8)
-    assert agent.num_timesteps == 8
-    seen, _ = env.reset(seed=0)
-    assert env.action_space.contains(agent.predict(seen)[0])
+    on_policy = agents.PPO("MultiInputPolicy", env, n_steps=4, batch_size=4, n_epochs=1, seed=0)
+    off_policy = agents.SAC("MultiInputPolicy", env, learning_starts=4, batch_size=4, buffer_size=16, seed=0)
+    for agent in (on_policy, off_policy):
+        agent.learn(8)
+        assert agent.num_timesteps == 8
+        seen, _ = env.reset(seed=0)
+        assert env.action_space.contains(agent.predict(seen)[0])
 
 
 def test_a_family_without_steps_is_named(clips: Store) -> None:
