@@ -19,6 +19,7 @@ from rsjax.config.fields import require, require_range
 from rsjax.devices import on_cpu
 from rsjax.errors import UserError, first_line
 from rsjax.progress import note
+from rsjax.tools.play.connections import most_connections
 from rsjax.tools.play.engine import Engine, EngineClosedError
 from rsjax.tools.play.guard import Guard, is_loopback
 from rsjax.tools.play.play_run import PlayRun
@@ -26,6 +27,7 @@ from rsjax.tools.play.serve import listen, prepare
 from rsjax.tools.play.session import first_settings
 from rsjax.tools.policies.judges.judge_training import judge_of
 from rsjax.tools.policies.worlds.environments import WorldModelEnv
+from rsjax.tools.serve.listener import BoundedListener
 from rsjax.tools.serve.session import Session
 from rsjax.tools.serve.shared_steps import SharedSteps
 from rsjax.tools.serve.wire import WireError, pack, unpack
@@ -35,6 +37,7 @@ STRIKES = 20  # messages in a row that cannot be answered, after which a client 
 VIDEO_BYTES = 64 * 2**20  # of a generated video; for large pictures this lowers the number of frames
 SPARE_BYTES = 64 * 2**10  # of a message beside its arrays
 LEAST_TOKEN = 16  # characters
+OPEN_SECONDS = 10  # within which a connection has to ask for something
 ACCELERATOR_LANES = 8
 
 
@@ -122,16 +125,17 @@ class WorldServer:
         )
 
     def open(self, listener: Socket) -> Server:
-        """Returns a server on a listening socket; its ``serve_forever`` accepts clients."""
+        """Returns a server that takes over a listening socket; its ``serve_forever`` accepts clients."""
         config = self._run.trained.config.clips
         frame = config.image_size**2 * (3 + 8)  # its depth may come as float64
         actions = self._frames * config.action_dim * 8
         return serve(
             self.serve_client,
-            sock=listener,
+            sock=BoundedListener(listener, most_connections(self._settings.clients)),
             origins=[None],  # no browser: a page of another site cannot reach the server through one
             process_request=self.refusal,
             compression=None,
+            open_timeout=OPEN_SECONDS,
             max_size=frame + actions + SPARE_BYTES,
             server_header=None,
         )
@@ -232,7 +236,7 @@ def serve_world(run: PlayRun, settings: WorldServerSettings) -> None:
     host = settings.host
     if ":" in host:
         host = f"[{host}]"
-    print(f"ws://{host}:{listener.getsockname()[1]}  (Ctrl-C ends it)", flush=True)
+    print(f"ws://{host}:{server.socket.getsockname()[1]}  (Ctrl-C ends it)", flush=True)
     print("next: docs/serve.md has ten lines of client code; curl http://…/healthz says whether it runs", flush=True)
     with suppress(KeyboardInterrupt):
         server.serve_forever()

@@ -2,11 +2,12 @@
 
 import http.client
 import re
+import socket
 import subprocess
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -30,6 +31,7 @@ from rsjax.errors import UserError
 from rsjax.models.branch_states import Decoding
 from rsjax.models.trained import TrainedModel
 from rsjax.tools.pipeline.run import Run
+from rsjax.tools.play.connections import most_connections
 from rsjax.tools.play.engine import Engine
 from rsjax.tools.play.play_run import PlayRun
 from rsjax.tools.play.serve import listen
@@ -82,7 +84,7 @@ def serving(run: PlayRun, **settings: Any) -> Iterator[str]:
     thread = threading.Thread(target=server.serve_forever, daemon=True)
     thread.start()
     try:
-        yield f"ws://127.0.0.1:{listener.getsockname()[1]}"
+        yield f"ws://127.0.0.1:{server.socket.getsockname()[1]}"
     finally:
         world.close()
         server.shutdown()
@@ -298,10 +300,67 @@ def test_a_token_is_wanted_and_no_browser_is_let_in(run: PlayRun) -> None:
             connect(url, additional_headers=headers, origin=Origin("http://evil.example")),
         ):
             pass
-        connection = http.client.HTTPConnection(url.removeprefix("ws://"), timeout=20)
+        assert is_healthy(url)
+
+
+def is_healthy(url: str) -> bool:
+    connection = http.client.HTTPConnection(url.removeprefix("ws://"), timeout=20)
+    with suppress(ConnectionError, http.client.HTTPException):
         connection.request("GET", "/healthz")
         answer = connection.getresponse()
-        assert (answer.status, answer.read()) == (200, b"OK\n")
+        return (answer.status, answer.read()) == (200, b"OK\n")
+    return False
+
+
+def idle(url: str, count: int, everything: ExitStack) -> list[socket.socket]:
+    host, _, port = url.removeprefix("ws://").partition(":")
+    return [everything.enter_context(socket.create_connection((host, int(port)), timeout=20)) for _ in range(count)]
+
+
+def is_closed(connection: socket.socket) -> bool:
+    connection.setblocking(False)
+    try:
+        return connection.recv(1) == b""
+    except BlockingIOError:
+        return False
+    except ConnectionError:
+        return True
+
+
+def test_connections_that_say_nothing_are_bounded_and_let_others_in_when_they_leave(run: PlayRun) -> None:
+    most = most_connections(1)
+    with serving(run, clients=1) as url:
+        with ExitStack() as everything:
+            connections = idle(url, most + 5, everything)
+            wait_until(lambda: sum(map(is_closed, connections)) == 5)
+        wait_until(lambda: is_healthy(url))
+
+
+SERVER_OF_FEW_FILES = """
+import resource, socket
+from websockets.sync.server import serve
+from rsjax.tools.serve.listener import BoundedListener
+
+listener = socket.create_server(("127.0.0.1", 0))
+resource.setrlimit(resource.RLIMIT_NOFILE, (32, 32))
+healthy = lambda connection, request: connection.respond(200, "OK\\n")
+server = serve(lambda connection: None, sock=BoundedListener(listener, 1000), process_request=healthy)
+print(f"ws://127.0.0.1:{server.socket.getsockname()[1]}", flush=True)
+server.serve_forever()
+"""
+
+
+def test_a_server_without_a_free_file_descriptor_waits_for_one() -> None:
+    with subprocess.Popen(
+        [sys.executable, "-c", SERVER_OF_FEW_FILES], cwd=ROOT, stdout=subprocess.PIPE, text=True
+    ) as server:
+        assert server.stdout is not None
+        url = server.stdout.readline().strip()
+        with ExitStack() as everything:
+            idle(url, 40, everything)
+        wait_until(lambda: server.poll() is not None or is_healthy(url))
+        assert server.poll() is None
+        server.kill()
 
 
 def test_a_client_that_says_nothing_is_disconnected(run: PlayRun) -> None:
