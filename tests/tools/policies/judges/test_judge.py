@@ -87,6 +87,9 @@ def test_a_judge_of_impossible_content_is_refused(judge: TrainedJudge, tmp_path:
         *({"temperature": value} for value in (None, 0.0, -1.0, float("nan"), "warm", [1.0])),
         *({"side": value} for value in (0, -4, 10**9, None)),
         {some: np.zeros((2, 2), np.float32)},
+        {some: whole[some].tolist()},
+        *({some: whole[some].astype(kind)} for kind in (str, int, complex)),
+        {some: np.full_like(whole[some], np.nan)},
         {"more": np.zeros(1, np.float32)},
         {name: None for name in whole if name not in ("temperature", "side")},
     )
