@@ -11,8 +11,9 @@ import stat
 import tempfile
 import time
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from rsjax.progress import note
 
 _HEAD = 512  # bytes at a file's start by which placeholders are recognised
 SEAL = "crc32"  # the field of a sealed JSON object that has its checksum
+DIGEST = "sha256"  # the entry of a sealed file of tensors' metadata that has its digest
 LONGEST_PATH = 4095  # bytes, on Linux
 LONGEST_NAME = 255
 LOCK_SECONDS = 0.25  # for this long a free lock may look taken, while other processes check it
@@ -173,8 +175,7 @@ def content_hash(path: Path, pattern: str = "*") -> str:
     """
 
     def hashed(file: Path) -> str:
-        with regular(file).open("rb") as content:
-            return hashlib.file_digest(content, "sha256").hexdigest()
+        return _file_hash(file, file_versions(file))
 
     try:
         if not path.is_dir():
@@ -184,6 +185,28 @@ def content_hash(path: Path, pattern: str = "*") -> str:
         return hashlib.sha256(json.dumps(shown).encode()).hexdigest()[:16]
     except OSError as error:
         raise FileError(f"{error.filename}: cannot be read ({error.strerror}); mend the path or permission") from error
+
+
+@lru_cache  # hashing large files takes seconds
+def _file_hash(path: Path, versions: tuple[tuple[int, ...], ...]) -> str:
+    with regular(path).open("rb") as content:
+        return hashlib.file_digest(content, "sha256").hexdigest()
+
+
+def file_versions(path: Path) -> tuple[tuple[int, ...], ...]:
+    """Returns size, time and inode of a file, or of each file of a folder; nothing of what cannot be looked at.
+
+    In the key of a cache they make it read a replaced file again.
+    """
+    files = [path]
+    if path.is_dir():
+        files = sorted(path.rglob("*"))
+    versions = []
+    for file in files:
+        with suppress(OSError):
+            status = file.stat()
+            versions.append((status.st_size, status.st_mtime_ns, status.st_ino))
+    return tuple(versions)
 
 
 def placeholder(content: Path | bytes) -> str:
@@ -260,6 +283,25 @@ def write_json(path: Path, content: Any, sealed: bool = False) -> None:
 
 def _seal(content: dict[str, Any]) -> int:
     return zlib.crc32(json.dumps(content).encode())
+
+
+def sealed_metadata(tensors: Mapping[str, Any], metadata: Mapping[str, str]) -> dict[str, str]:
+    """Returns the metadata of a file of tensors with a digest of both, which :func:`is_intact` compares."""
+    return {**metadata, DIGEST: _digest(tensors, metadata)}
+
+
+def is_intact(tensors: Mapping[str, Any], metadata: Mapping[str, str]) -> bool:
+    """Returns whether a file of tensors has the content that it was written with, or has no digest, as older ones."""
+    content = {name: text for name, text in metadata.items() if name != DIGEST}
+    return DIGEST not in metadata or metadata[DIGEST] == _digest(tensors, content)
+
+
+def _digest(tensors: Mapping[str, Any], metadata: Mapping[str, str]) -> str:
+    digest = hashlib.sha256(json.dumps(sorted(metadata.items())).encode())
+    for name, x in sorted(tensors.items()):
+        digest.update(f"{name} {x.dtype} {x.shape}".encode())
+        digest.update(x.tobytes())
+    return digest.hexdigest()
 
 
 @contextmanager

@@ -152,7 +152,6 @@ DOCUMENTED: dict[str, str] = {
     "files: data/lift-*/manifest.json": "a data set without a manifest that can be read is simulated again",
     "files: data/lift-*/test-*.array_record": "a clip is read when it is asked for, and refused then",
     "plan with the judge": "the simulator opens first, and the judge is read then",
-    "files: run/evaluation/result.json with": "a bit or a text that leaves it a result, as an editor would",
     "files: run/metrics.json": "the card has the scores that can be read",
     "files: saved/clips/manifest.json with a flipped bit": "a bit in a text, such as a name of an episode",
     "files: run/run.json with a flipped bit": "a bit in a text, such as the command",

@@ -136,7 +136,7 @@ def write_result(folder: Path, result: Result, frames: Mapping[str, np.ndarray])
         FileError: the disk is full.
     """
     write_file(folder / FRAMES, encode(dict(frames)))
-    write_json(folder / NAME, asdict(result))
+    write_json(folder / NAME, asdict(result), sealed=True)
 
 
 def read_result(folder: Path) -> Result:

@@ -5,7 +5,7 @@ Its weights are not part of this project. They are read from one safetensors fil
 
     backbone.{i}.weight, .bias   torchvision's ``features.{i}``: (out, in, kernel, kernel), (out,)
     head.{k}.weight              of tap k: (1, channels, 1, 1)
-    metadata                     {"net": "alexnet" | "vgg16"}
+    metadata                     {"net": "alexnet" | "vgg16", "sha256": digest of tensors and metadata}
 """
 
 from pathlib import Path
@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 from safetensors import SafetensorError, safe_open
 
 from rsjax.errors import UserError
-from rsjax.files import placeholder
+from rsjax.files import is_intact, placeholder
 
 
 class LpipsError(UserError):
@@ -101,11 +101,14 @@ def load_lpips(path: str | Path, wanted_net: str = "") -> dict[str, Any]:
         raise LpipsError(f"{path}: no such LPIPS weights; make them with rsjax convert lpips")
     try:
         with safe_open(path, framework="numpy") as file:
-            net = (file.metadata() or {}).get("net")
+            metadata = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - it is no dict
     except SafetensorError as error:
         instead = placeholder(Path(path)) or f"not a safetensors file, or damaged ({error}); make it again"
         raise LpipsError(f"{path}: {instead}") from error
+    if not is_intact(tensors, metadata):
+        raise LpipsError(f"{path}: damaged (its digest is wrong); make it again with rsjax convert lpips")
+    net = metadata.get("net")
     if net not in NETS:
         raise LpipsError(f"{path}: its metadata name the net {net!r}, not one of {', '.join(NETS)}; make it again")
     if wanted_net not in ("", net):

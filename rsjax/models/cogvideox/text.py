@@ -1,7 +1,8 @@
 """Reads and writes files of text embeddings, and finds the text of each clip.
 
 A file of ``rsjax convert text`` has a tensor ``embeddings``, (texts, tokens, width). Its metadata lists
-the texts in the same order; the first text is empty. Learned tokens are numbered in the same way.
+the texts in the same order, the first of which is empty, and has a digest of both. Learned tokens are numbered in the
+same way.
 """
 
 import json
@@ -18,6 +19,7 @@ from jaxtyping import Float32
 from rsjax.clip import UNKNOWN
 from rsjax.data.store import Store
 from rsjax.errors import UserError, first_line
+from rsjax.files import file_versions, is_intact, sealed_metadata
 from rsjax.models.cogvideox.config import TextConfig
 from rsjax.progress import note
 
@@ -43,19 +45,21 @@ def read_texts(file: str, tokens: int, width: int) -> Texts:
     path = Path(file)
     if not path.is_file():
         raise UserError(f"{path}: no such file of text embeddings; {CURE}")
-    status = path.stat()
-    return _read_texts(path, tokens, width, (status.st_size, status.st_mtime_ns, status.st_ino))
+    return _read_texts(path, tokens, width, file_versions(path))
 
 
 @lru_cache(maxsize=1)
-def _read_texts(path: Path, tokens: int, width: int, version: tuple[int, ...]) -> Texts:
-    """Reads the file; ``version``, its size, time and inode, makes the cache read a replaced file again."""
+def _read_texts(path: Path, tokens: int, width: int, versions: tuple[tuple[int, ...], ...]) -> Texts:
     try:
         with safetensors.safe_open(path, "np") as opened:
-            names = json.loads((opened.metadata() or {}).get(TEXTS, "[]"))
+            metadata = opened.metadata() or {}
+            names = json.loads(metadata.get(TEXTS, "[]"))
             made = None
             if EMBEDDINGS in opened.keys():  # noqa: SIM118 - it is no dict
-                made = opened.get_tensor(EMBEDDINGS).astype(np.float32)
+                stored = opened.get_tensor(EMBEDDINGS)
+                if not is_intact({EMBEDDINGS: stored}, metadata):
+                    raise ValueError("its digest is wrong")
+                made = stored.astype(np.float32)
     except (safetensors.SafetensorError, OSError, ValueError, AttributeError) as error:  # the last: a type of 8 bits
         raise UserError(f"{path}: not a file of text embeddings, or damaged ({first_line(error)}); {CURE}") from error
     listed = isinstance(names, list) and names[:1] == [EMPTY] and all(isinstance(name, str) for name in names)
@@ -73,9 +77,9 @@ def _read_texts(path: Path, tokens: int, width: int, version: tuple[int, ...]) -
 
 def write_texts(names: Sequence[str], embeddings: Float32[np.ndarray, "texts n w"]) -> bytes:
     """Returns the content of a file of embeddings."""
-    return safetensors.numpy.save(
-        {EMBEDDINGS: np.ascontiguousarray(embeddings)}, {TEXTS: json.dumps(list(names), ensure_ascii=False)}
-    )
+    tensors = {EMBEDDINGS: np.ascontiguousarray(embeddings)}
+    metadata = {TEXTS: json.dumps(list(names), ensure_ascii=False)}
+    return safetensors.numpy.save(tensors, sealed_metadata(tensors, metadata))
 
 
 def texts_of(config: TextConfig, tasks: Iterable[str] | None, count: int) -> np.ndarray:

@@ -8,6 +8,7 @@ import re
 from collections.abc import Iterable
 from pathlib import Path
 
+from rsjax.files import sealed_metadata
 from rsjax.tokenizers.lpips import NETS, lpips_shapes
 from rsjax.tools.convert.files import ConvertError, Tensors, check_file, left_aside, write_safetensors
 from rsjax.tools.convert.sources import read_network, weights_file
@@ -79,6 +80,6 @@ def convert(sources: list[Path], out: Path) -> list[str]:
         names |= own
         aside += sum(others.values())
     net, weights = from_public(", ".join(map(str, sources)), merged, names)
-    write_safetensors(out, weights, {"net": net})
+    write_safetensors(out, weights, sealed_metadata(weights, {"net": net}))
     lines = left_aside({"other layers or networks": aside + len(merged) - len(weights)})
     return [f"{out}: LPIPS with {net}, {len(weights)} tensors{replaces}", *lines]

