@@ -18,6 +18,7 @@ from rsjax.evaluation.metrics.lpips import FILES
 from rsjax.files import content_hash
 from rsjax.tools.ingest.annotators.choose import choose
 from rsjax.tools.ingest.annotators.depth import inverse_of
+from rsjax.tools.ingest.annotators.network import CHECKOUT
 from rsjax.tools.ingest.episode import Episode
 from rsjax.tools.ingest.pictures import ArrayFrames
 
@@ -113,7 +114,7 @@ def by_content(settings: EvalConfig) -> EvalConfig:
         fields = []
         for name, value in vars(annotator).items():
             if isinstance(value, Path):
-                value = content_hash(value, "*.py" if name == "checkout" else "*")
+                value = content_hash(value, "*.py" if name == CHECKOUT else "*")
             fields.append(f"{name}={value}")
         hashes["depth_estimator"] = f"{settings.depth_estimator.partition(':')[0]}:{','.join(fields)}"
     return replace(settings, **hashes)

@@ -9,7 +9,6 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, fields, is_dataclass, replace
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -263,7 +262,6 @@ class Run:
             yield folder
 
 
-@cache  # hashing large files takes seconds
 def _hashed(settings: EvalConfig) -> EvalConfig:
     """Returns the settings with paths of weights replaced by content hashes."""
     from rsjax.tools.pipeline.metric_files import by_content  # here, because it loads jax

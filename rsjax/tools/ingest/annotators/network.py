@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from rsjax.errors import first_line
-from rsjax.files import placeholder
+from rsjax.files import file_versions, placeholder
 from rsjax.tools.ingest.annotators.protocols import AnnotationError, Annotator
 
+CHECKOUT = "checkout"  # the field of a folder of code, which a process imports once
 EXTRA = "pip install 'rsjax[annotate]'"
 
 
@@ -29,7 +30,8 @@ class Network(Annotator):
 
     def load(self) -> Any:
         """Returns what :meth:`build` makes; errors as in :meth:`Annotator.load`."""
-        return _build(self)
+        named = [value for name, value in vars(self).items() if isinstance(value, Path) and name != CHECKOUT]
+        return _build(self, tuple(map(file_versions, named)))
 
     def build(self) -> Any:
         """Makes the network from local files, ready for inference on ``device``."""
@@ -37,7 +39,7 @@ class Network(Annotator):
 
 
 @lru_cache(maxsize=5)  # one for each stage
-def _build(network: Network) -> Any:
+def _build(network: Network, versions: tuple[tuple[tuple[int, ...], ...], ...]) -> Any:
     library("torch", network.title)
     return network.build()
 

@@ -8,8 +8,9 @@ from pathlib import Path
 
 from rsjax.config import SimConfig
 from rsjax.data.codec import Record
-from rsjax.data.store import open_store
+from rsjax.data.store import MANIFEST, open_store
 from rsjax.errors import UserError
+from rsjax.files import file_versions
 from rsjax.tools.sim.episode import POLICY, EpisodePlan, Replay
 
 
@@ -19,7 +20,7 @@ def recorded(config: SimConfig, store: Path, place: int, name: str) -> EpisodePl
     Raises:
         UserError: the store is missing, was not recorded from policies, or has shorter episodes or other actions.
     """
-    episodes = _episodes(store)
+    episodes = _episodes(store, file_versions(store / MANIFEST))
     episode = episodes[place % len(episodes)]
     frames, width = episode["actions"].shape
     if frames < config.frames or width != config.action_dim:
@@ -33,7 +34,7 @@ def recorded(config: SimConfig, store: Path, place: int, name: str) -> EpisodePl
 
 
 @cache
-def _episodes(store: Path) -> list[Record]:
+def _episodes(store: Path, versions: tuple[tuple[int, ...], ...]) -> list[Record]:
     """Returns the actions and the provenance of the recorded episodes."""
     source = open_store(store).source("train")
     episodes: list[Record] = []

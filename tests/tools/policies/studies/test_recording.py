@@ -1,5 +1,6 @@
 """Recorded policies, and the recipe that simulates their episodes once more."""
 
+import os
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -9,11 +10,13 @@ import numpy as np
 import pytest
 
 from rsjax.config import SimConfig
+from rsjax.data.store import MANIFEST, write_store
 from rsjax.errors import UserError
 from rsjax.tools.policies.on_policy import rollouts
 from rsjax.tools.policies.worlds.simulator_world import SimulatorWorld
-from rsjax.tools.sim.episode import run_episode
+from rsjax.tools.sim.episode import POLICY, run_episode
 from rsjax.tools.sim.recipes.plans import training_plans
+from rsjax.tools.sim.recipes.recorded import recorded
 from tests.tools.policies.toy import demo_store
 
 CONFIG = SimConfig(episodes=5, test_episodes=1, frames=3, tracks=20, seed=5, camera="near", control_steps=2)
@@ -49,6 +52,17 @@ def test_what_a_policy_did_is_simulated_again(gl: str, tmp_path: Path) -> None:
     with pytest.raises(UserError) as refused:
         training_plans(replace(mix, frames=9))
     assert "episodes of 3 frames and 14 numbers an action; sim.frames 9" in str(refused.value)
+
+
+def test_another_recording_at_the_same_path_is_read(tmp_path: Path) -> None:
+    seeds = []
+    for seed in (1, 2):
+        provenance = {"expert": {"mode": POLICY}, "episode": 0, "seed": seed}
+        record = {"actions": np.zeros((CONFIG.frames, CONFIG.action_dim), np.float32), "provenance": provenance}
+        write_store(tmp_path / "store", "clips", {"train": [record]}, {})
+        os.utime(tmp_path / "store" / MANIFEST, (seed, seed))  # the clock may be too coarse, and the inode the same
+        seeds.append(recorded(CONFIG, tmp_path / "store", 0, "episode").seed)
+    assert seeds == [1, 2]
 
 
 def test_clips_that_no_policy_made_are_no_recordings(tmp_path: Path) -> None:

@@ -1,11 +1,15 @@
+import os
 import socket
 import sys
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
 
 import pytest
 
 from rsjax.tools.ingest.annotators.depth import DepthAnything, VideoDepthAnything
 from rsjax.tools.ingest.annotators.motion import RaftFlow
-from rsjax.tools.ingest.annotators.network import checkout_module, library, load_weights, on_device
+from rsjax.tools.ingest.annotators.network import Network, checkout_module, library, load_weights, on_device
 from rsjax.tools.ingest.annotators.protocols import AnnotationError
 from rsjax.tools.ingest.annotators.semantics import InternVL
 from rsjax.tools.ingest.annotators.shots import TransNetShots
@@ -83,6 +87,26 @@ def test_weights_are_checked(tmp_path):
     other = torch.nn.Linear(2, 3)
     torch.save({"state_dict": other.state_dict()}, file)
     assert torch.equal(load_weights(model, file, "cpu", "Net").weight, other.weight)
+
+
+@dataclass(frozen=True)
+class Reader(Network):
+    title = "Reader"
+    weights: Path
+
+    def build(self):
+        return {file.name: file.read_bytes() for file in self.weights.iterdir()}
+
+
+def test_a_network_is_loaded_once_until_its_files_change(monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "torch", ModuleType("torch"))
+    file = tmp_path / "model"
+    file.write_bytes(b"1")
+    first = Reader(tmp_path).load()
+    assert Reader(tmp_path).load() is first
+    file.write_bytes(b"2")
+    os.utime(file, (1, 1))  # the clock of a file system may be too coarse for two writes
+    assert Reader(tmp_path).load() == {"model": b"2"}
 
 
 def test_a_missing_device_is_named():
