@@ -91,6 +91,7 @@ def test_weights_are_checked(tmp_path):
 
 @dataclass(frozen=True)
 class Reader(Network):
+    name = "reader"
     title = "Reader"
     weights: Path
 
