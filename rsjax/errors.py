@@ -9,6 +9,8 @@ from collections.abc import Iterable
 class UserError(Exception):
     """An error that the user can fix. The message is one line that names what is wrong and the cure.
 
+    Parts of a file's name that are no text, surrogates, are shown as escapes, since no terminal could print them.
+
     Not a :class:`ValueError`, because some libraries, such as the command-line parser, catch those.
 
     Attributes:
@@ -18,7 +20,8 @@ class UserError(Exception):
     status = 2
 
     def __init__(self, message: object = "") -> None:
-        super().__init__(" ".join(map(str.strip, str(message).splitlines())))  # an array that it shows may have lines
+        line = " ".join(map(str.strip, str(message).splitlines()))  # an array that it shows may have lines
+        super().__init__(line.encode(errors="backslashreplace").decode())
 
 
 def did_you_mean(word: str, choices: Iterable[str], prefix: str = "") -> str:

@@ -41,6 +41,12 @@ from rsjax.training.log import read_rows
 from tests.tools.ingest.toy import Source
 
 
+def test_an_error_can_be_printed_whatever_the_name_of_a_file() -> None:
+    with pytest.raises(UserError) as error:
+        rsjax.load("\udc80")
+    assert "\\udc80" in str(error.value) and str(error.value).isprintable()
+
+
 def test_a_hash_of_content_is_the_files_wherever_they_lie(tmp_path: Path) -> None:
     for place in ("a", "b"):
         (tmp_path / place / "sub").mkdir(parents=True)

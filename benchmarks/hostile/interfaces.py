@@ -11,6 +11,7 @@ import numpy as np
 from benchmarks.hostile.cases import Case, Ended, Place, call
 
 NAN = float("nan")
+FILE = object()  # stands for the path of a file in a case's own folder
 JUNK: dict[str, Any] = {
     "None": None,
     "True": True,
@@ -20,6 +21,7 @@ JUNK: dict[str, Any] = {
     "10**400": 10**400,
     "2**63": 2**63,
     "an empty text": "",
+    "an existing file": FILE,
     "a long text": "x" * 100_000,
     "a surrogate": "\udcff",
     "a null byte": "a\0b",
@@ -55,12 +57,15 @@ DOCUMENTED = {
     "api: model.save(card) = a* *": "any text is a card",
     "environments: make, data_dir = a surrogate": "clips are looked for at reset",
     "environments: make, store = a surrogate": "clips are looked for at reset",
+    "environments: make, data_dir = an existing file": "clips are looked for at reset",
+    "environments: make, store = an existing file": "clips are looked for at reset",
     "environments: make, store = None": "no other store",
     "environments: *, split = a* *": "splits are looked up at reset",
     "environments: *, judge = None": "no judge, so every reward is 0",
     "environments: *, judge = a function": "any function of frames is a judge",
-    "environments: reset*, seed* = None": "no seed",
-    "environments: reset*, options = None": "no options",
+    "environments: *, render_mode = None": "nothing is rendered",
+    "environments: *reset*, seed* = None": "no seed",
+    "environments: *reset*, options = None": "no options",
     "environments: reset, option clip = None": "any clip",
     "arrays: * as nested lists": "lists of numbers are arrays",
     "arrays: * as a matrix of another order": "the order of memory does not matter",
@@ -99,7 +104,14 @@ def _case(group: str, name: str, word: str, act: Callable[[Place], Ended]) -> Ca
 
 
 def _with(act: Callable[[Place, Any], object], value: Any) -> Callable[[Place], Ended]:
-    return lambda place: call(lambda: act(place, value))
+    def acting(place: Place) -> Ended:
+        given = value
+        if value is FILE:
+            given = str(place.scratch / "file")
+            Path(given).touch()
+        return call(lambda: act(place, given))
+
+    return acting
 
 
 @cache
@@ -264,6 +276,29 @@ def _making(kind: str, name: str) -> Callable[[Place, Any], object]:
     return act
 
 
+def _of_class(kind: str, name: str) -> Callable[[Place, Any], object]:
+    """Returns a call of an environment's class itself, where Gymnasium checks nothing first."""
+
+    def act(place: Place, value: Any) -> object:
+        from rsjax.tools.policies.worlds.environments import LiftEnv, WorldModelEnv
+        from rsjax.tools.serve.client import RemoteWorldModelEnv
+
+        if kind == "Remote":
+            return RemoteWorldModelEnv(**({"url": NOBODY} | {name: value}))
+        if kind == "Lift":
+            return LiftEnv(**{name: value})
+        return WorldModelEnv(**({"run": place.material / "run", "data_dir": place.material / "data"} | {name: value}))
+
+    return act
+
+
+@cache
+def _lift() -> Any:
+    from rsjax.tools.policies.worlds.environments import LiftEnv
+
+    return LiftEnv()
+
+
 def _vector(name: str) -> Callable[[Place, Any], object]:
     def act(place: Place, value: Any) -> object:
         from rsjax.tools.policies.worlds.environments import WorldModelVectorEnv
@@ -286,11 +321,20 @@ def _step(env: Any, value: Any) -> object:
 
 
 MODEL = "rsjax/WorldModel-v0"
+NOBODY = "ws://127.0.0.1:1"  # no server listens there
 ENVIRONMENTS: dict[str, Callable[[Place, Any], object]] = {
     **{
         f"make, {name}": _making(MODEL, name)
         for name in ("run", "data_dir", "store", "split", "max_steps", "judge", "out_of_range", "depth", "ofenrohr")
     },
+    "WorldModelEnv, render_mode": _of_class("WorldModel", "render_mode"),
+    **{f"LiftEnv, {name}": _of_class("Lift", name) for name in ("config", "max_steps", "out_of_range", "render_mode")},
+    **{
+        f"RemoteWorldModelEnv, {name}": _of_class("Remote", name)
+        for name in ("url", "token", "max_steps", "render_mode")
+    },
+    "LiftEnv, reset, seed": lambda place, value: _lift().reset(seed=value),
+    "LiftEnv, reset, options": lambda place, value: _lift().reset(options=value),
     **{f"vector environment, {name}": _vector(name) for name in ("run", "num_envs", "max_steps", "judge", "split")},
     "reset, seed": lambda place, value: _env(place).reset(seed=value),
     "reset, options": lambda place, value: _env(place).reset(options=value),

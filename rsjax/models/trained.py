@@ -12,7 +12,7 @@ from jaxtyping import Float, Float32, Int, UInt8
 from rsjax.clip import Video
 from rsjax.config import Config, to_dict
 from rsjax.errors import UserError
-from rsjax.files import checked_path
+from rsjax.files import check_place, checked_path
 from rsjax.model_directory import Dtype, Part, save_directory
 from rsjax.models.base import Assets, WorldModel
 from rsjax.models.card import model_card
@@ -153,6 +153,7 @@ class TrainedModel:
             FileError: the disk is full or cannot be written to.
         """
         directory = checked_path(directory, "directory")
+        check_place(directory, "directory", directory=True)
         if not isinstance(dtype, str) or dtype not in get_args(Dtype):
             raise UserError(f"dtype is {dtype!r:.80}; choose {' or '.join(get_args(Dtype))}")
         if not isinstance(card, str):

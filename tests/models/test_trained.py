@@ -246,8 +246,11 @@ def test_a_wrong_argument_is_named_with_what_was_expected(case: str, model: Trai
 
 def test_a_wrong_argument_of_save_is_named(model: TrainedModel, tmp_path: Path) -> None:
     place = tmp_path / "saved"
+    file = tmp_path / "file"
+    file.touch()
     wrong: dict[str, dict[str, Any]] = {
         "directory is None": {"directory": None},
+        "file: no directory; choose another path": {"directory": file},
         "dtype is None; choose float32 or float16": {"directory": place, "dtype": None},
         "dtype is 'int32'": {"directory": place, "dtype": "int32"},
         "card is bytes": {"directory": place, "card": b"x"},

@@ -11,10 +11,11 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 from jaxtyping import Float
-from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketException
 from websockets.sync.client import connect
 
-from rsjax.errors import UserError
+from rsjax.errors import UserError, first_line
+from rsjax.tools.policies.worlds.arguments import check_render_mode, checked_count, checked_seed
 from rsjax.tools.serve.wire import pack, unpack
 
 URL = "ws://127.0.0.1:8643"
@@ -41,7 +42,11 @@ class WorldClient:
     """
 
     def __init__(self, url: str = URL, token: str | None = None, timeout: float = 600.0) -> None:
+        if not isinstance(url, str):
+            raise ServerError(f"url is {url!r:.80}; give the address that the server printed, such as {URL}")
         secret = token or os.environ.get("RSJAX_TOKEN", "")
+        if not isinstance(secret, str) or not (secret.isascii() and secret.isprintable()):
+            raise ServerError("the token is no text of printable ASCII characters; give the server's RSJAX_TOKEN")
         headers = {}
         if secret:
             headers["Authorization"] = f"Api-Key {secret}"
@@ -54,7 +59,11 @@ class WorldClient:
             body = (error.response.body or b"").decode(errors="replace").strip()
             raise ServerError(f"{url}: {body or error}") from error
         except (OSError, ConnectionClosed) as error:
-            raise ServerError(f"{url}: no server answers ({error}); rsjax serve RUN starts one") from error
+            raise ServerError(f"{url:.80}: no server answers ({error}); rsjax serve RUN starts one") from error
+        except (WebSocketException, ValueError) as error:
+            raise ServerError(
+                f"{url!r:.80}: no server to talk to ({first_line(error)}); give one such as {URL}"
+            ) from error
         try:
             self.metadata = self._receive()
         except UserError:
@@ -117,7 +126,7 @@ class RemoteWorldModelEnv(gymnasium.Env[Any, Any]):
         render_mode: "rgb_array", or None.
 
     Raises:
-        ServerError: there is no server, or it refuses the client.
+        UserError: there is no server, it refuses the client, or an argument is not allowed.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 5}  # noqa: RUF012 - Gymnasium's own type
@@ -125,12 +134,14 @@ class RemoteWorldModelEnv(gymnasium.Env[Any, Any]):
     def __init__(
         self, url: str = URL, token: str | None = None, max_steps: int = 30, render_mode: str | None = None
     ) -> None:
+        check_render_mode(render_mode, self.metadata)
         self.client = WorldClient(url, token)
         facts = self.client.metadata
-        most = facts["limits"]["frames"] - 1
-        if not 1 <= max_steps <= most:
+        try:
+            checked_count("max_steps", max_steps, facts["limits"]["frames"] - 1)
+        except UserError as error:
             self.client.close()
-            raise ServerError(f"max_steps is {max_steps}; this server's episodes have from 1 to {most}")
+            raise ServerError(error) from error
         side = facts["image_size"]
         seen: dict[str, spaces.Space[Any]] = {"rgb": spaces.Box(0, 255, (side, side, 3), np.uint8)}
         if "depth_high" in facts:
@@ -148,12 +159,15 @@ class RemoteWorldModelEnv(gymnasium.Env[Any, Any]):
         """Begins an episode; arguments as for :meth:`WorldModelEnv.reset`.
 
         Raises:
-            ServerError: the server cannot begin it.
+            UserError: the server cannot begin it, or an argument is not allowed.
         """
+        seed = checked_seed(seed)
         super().reset(seed=seed)
-        start = dict(options or {})
+        start = {} if options is None else options
+        if not isinstance(start, dict) or not all(isinstance(name, str) for name in start):
+            raise UserError(f"options are {start!r:.80}; give a dict with some of rgb, depth, clip and draw")
         if seed is not None:
-            start["seed"] = int(seed)
+            start = start | {"seed": seed}
         self._steps = 0
         return self._seen(self.client.reset(**start))
 

@@ -395,6 +395,30 @@ def test_where_nobody_serves_the_client_says_what_to_do() -> None:
     assert "rsjax serve RUN starts one" in str(error.value)
 
 
+ADDRESSES: tuple[Any, ...] = ("", None, 5, "http://a", "x" * 5000, "ws://" + "x" * 5000, "ws://[::1", "ws://a\0b")
+
+
+@pytest.mark.parametrize("url", ADDRESSES)
+def test_what_is_no_address_is_refused_in_one_line(url: Any) -> None:
+    with pytest.raises(ServerError) as error:
+        RemoteWorldModelEnv(url)
+    assert "such as ws://127.0.0.1:8643" in str(error.value) and len(str(error.value)) < 400
+
+
+def test_junk_for_the_remote_environment_is_refused(url: str) -> None:
+    junk: tuple[dict[str, Any], ...] = ({"token": "a\nb"}, {"token": 5}, {"render_mode": 5}, {"max_steps": "x"})
+    for arguments in junk:
+        with pytest.raises(UserError) as error:
+            RemoteWorldModelEnv(url, **arguments)
+        assert next(iter(arguments)) in str(error.value)
+    env = RemoteWorldModelEnv(url, max_steps=2)
+    for wrong in (5, {5: 1}):
+        with pytest.raises(UserError) as error:
+            env.reset(options=wrong)  # type: ignore[arg-type]
+        assert "options are" in str(error.value)
+    env.close()
+
+
 def test_the_documented_client_runs(url: str) -> None:
     block = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "serve.md").read_text(), re.DOTALL)[0]
     names: dict[str, Any] = {}

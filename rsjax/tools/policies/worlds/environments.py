@@ -30,6 +30,7 @@ from rsjax.tools.policies.judges.judge import LABELS, Judge
 from rsjax.tools.policies.judges.judge_training import judge_of
 from rsjax.tools.policies.run_data import RunData
 from rsjax.tools.policies.worlds.actions import OutOfRange, action_range, check_out_of_range, check_takes_actions
+from rsjax.tools.policies.worlds.arguments import check_render_mode, checked_count, checked_seed
 from rsjax.tools.policies.worlds.model_world import FirstFrame, ModelWorld
 from rsjax.tools.policies.worlds.simulator_world import SimulatorWorld
 from rsjax.tools.policies.worlds.starts import Starts
@@ -39,7 +40,6 @@ from rsjax.tools.sim.expert import State
 FAR = 10.0  # metres; nothing that the simulator's cameras see is farther
 MOST_STEPS = 10**6  # of an episode
 MOST_ENVIRONMENTS = 2**16
-MOST_SEEDS = 2**32
 STEPS = 30  # default length of an episode: 6 s at 5 frames per second
 DEFAULT = SimConfig(camera="near")
 
@@ -95,30 +95,6 @@ class EnvironmentSettings:
                 hint = did_you_mean(name, known)
                 raise UserError(f"an environment has no setting {name}{hint} (settings: {', '.join(known)})")
         return cls(**values)
-
-
-def checked_count(name: str, count: object, most: int) -> int:
-    """Returns a whole number from 1 to ``most``.
-
-    Raises:
-        UserError: it is none.
-    """
-    if isinstance(count, bool) or not isinstance(count, int | np.integer) or not 1 <= count <= most:
-        raise UserError(f"{name} is {count!r:.80}; it is a whole number from 1 to {most}")
-    return int(count)
-
-
-def checked_seed(seed: object) -> int | None:
-    """Returns the seed of one environment.
-
-    Raises:
-        UserError: it is neither None nor a whole number from 0 to 2³² - 1.
-    """
-    if seed is None:
-        return None
-    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or not 0 <= seed < MOST_SEEDS:
-        raise UserError(f"seed is {seed!r:.80}; it is a whole number from 0 to {MOST_SEEDS - 1}")
-    return int(seed)
 
 
 class _Model:
@@ -255,6 +231,7 @@ class WorldModelEnv(gymnasium.Env[Any, Any]):
         imagination: Imagination | None = None,
         **settings: Any,
     ) -> None:
+        check_render_mode(render_mode, self.metadata)
         self._settings = EnvironmentSettings.read(settings)
         model = _Model(run, 1, self._settings, imagination)
         self._model = model
@@ -449,7 +426,7 @@ class LiftEnv(gymnasium.Env[Any, Any]):
     Raises:
         GLError: no OpenGL context can be made.
         ConfigError: there is no such camera, or the clips are of another simulator.
-        UserError: ``out_of_range`` is neither of the two.
+        UserError: another argument is not allowed.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 5}  # noqa: RUF012 - Gymnasium's own type
@@ -461,8 +438,11 @@ class LiftEnv(gymnasium.Env[Any, Any]):
         out_of_range: OutOfRange = "clip",
         render_mode: str | None = None,
     ) -> None:
+        if not isinstance(config, SimConfig):
+            raise UserError(f"config is {config!r:.80}; give a SimConfig, such as load_config(run).sim")
         checked_count("max_steps", max_steps, MOST_STEPS)
         check_out_of_range(out_of_range)
+        check_render_mode(render_mode, self.metadata)
         self._world = SimulatorWorld.lift(config, 1)
         self._max_steps = max_steps
         self._out_of_range = out_of_range
@@ -492,9 +472,14 @@ class LiftEnv(gymnasium.Env[Any, Any]):
     ) -> tuple[Observation, dict[str, Any]]:
         """Begins an episode; the seed (0 … 2³² - 1) determines the arm's start and the cube's place.
 
-        If there is no seed, one is drawn from the generator that the last seed started.
+        If there is no seed, one is drawn from the generator that the last seed started. There are no options.
+
+        Raises:
+            UserError: the seed is not allowed, or there are options.
         """
         seed = checked_seed(seed)
+        if options is not None and (not isinstance(options, dict) or options):
+            raise UserError(f"options are {options!r:.80}; an episode in the simulator has none, only a seed")
         super().reset(seed=seed)
         if seed is None:
             start = int(self.np_random.integers(2**32))

@@ -222,6 +222,7 @@ def test_junk_is_refused_at_one_border(env: WorldModelEnv, model: TrainedModel, 
         "judge": (7, [1]),
         "out_of_range": ("ignore", None),
         "max_step": (9,),
+        "render_mode": ("human", 5, np.zeros(2)),
     }
     for name, values in settings.items():
         for value in values:

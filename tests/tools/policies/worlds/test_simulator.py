@@ -75,6 +75,19 @@ def test_another_simulator_is_refused() -> None:
         LiftEnv(replace(CONFIG, env="metaworld"))
 
 
+def test_junk_is_refused(env: LiftEnv) -> None:
+    junk: tuple[dict[str, Any], ...] = ({"config": None}, {"config": 5}, {"render_mode": "junk"}, {"render_mode": 5})
+    for arguments in junk:
+        with pytest.raises(UserError) as error:
+            LiftEnv(**arguments)
+        assert next(iter(arguments)) in str(error.value)
+    options: tuple[Any, ...] = (5, {"junk": 1}, [], np.zeros(2))
+    for wrong in options:
+        with pytest.raises(UserError) as error:
+            env.reset(options=wrong)
+        assert "options are" in str(error.value)
+
+
 def test_gymnasiums_checker_passes(env: LiftEnv) -> None:
     check_env(env, skip_render_check=True)
     assert "rsjax/Lift-v0" in gymnasium.registry
