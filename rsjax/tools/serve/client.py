@@ -59,7 +59,7 @@ class WorldClient:
             body = (error.response.body or b"").decode(errors="replace").strip()
             raise ServerError(f"{url}: {body or error}") from error
         except (OSError, ConnectionClosed) as error:
-            raise ServerError(f"{url:.80}: no server answers ({error}); rsjax serve RUN starts one") from error
+            raise ServerError(f"{url!r:.80}: no server answers ({error}); rsjax serve RUN starts one") from error
         except (WebSocketException, ValueError) as error:
             raise ServerError(
                 f"{url!r:.80}: no server to talk to ({first_line(error)}); give one such as {URL}"

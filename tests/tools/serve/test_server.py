@@ -395,7 +395,7 @@ def test_where_nobody_serves_the_client_says_what_to_do() -> None:
     assert "rsjax serve RUN starts one" in str(error.value)
 
 
-ADDRESSES: tuple[Any, ...] = ("", None, 5, "http://a", "x" * 5000, "ws://" + "x" * 5000, "ws://[::1", "ws://a\0b")
+ADDRESSES: tuple[Any, ...] = ("", None, 5, "http://a", "x" * 5000, "ws://" + "x" * 5000, "ws://[::1")
 
 
 @pytest.mark.parametrize("url", ADDRESSES)
