@@ -44,9 +44,11 @@ class WorldClient:
     def __init__(self, url: str = URL, token: str | None = None, timeout: float = 600.0) -> None:
         if not isinstance(url, str):
             raise ServerError(f"url is {url!r:.80}; give the address that the server printed, such as {URL}")
+        if token is not None and not isinstance(token, str):
+            raise ServerError(f"token is {type(token).__name__}; it is the text of the server's RSJAX_TOKEN")
         secret = token or os.environ.get("RSJAX_TOKEN", "")
-        if not isinstance(secret, str) or not (secret.isascii() and secret.isprintable()):
-            raise ServerError("the token is no text of printable ASCII characters; give the server's RSJAX_TOKEN")
+        if not (secret.isascii() and secret.isprintable()):
+            raise ServerError("the token has other characters than printable ASCII; give the server's RSJAX_TOKEN")
         headers = {}
         if secret:
             headers["Authorization"] = f"Api-Key {secret}"

@@ -406,7 +406,12 @@ def test_what_is_no_address_is_refused_in_one_line(url: Any) -> None:
 
 
 def test_junk_for_the_remote_environment_is_refused(url: str) -> None:
-    junk: tuple[dict[str, Any], ...] = ({"token": "a\nb"}, {"token": 5}, {"render_mode": 5}, {"max_steps": "x"})
+    junk: tuple[dict[str, Any], ...] = (
+        {"token": "a\nb"},
+        {"token": np.zeros(0)},
+        {"render_mode": 5},
+        {"max_steps": "x"},
+    )
     for arguments in junk:
         with pytest.raises(UserError) as error:
             RemoteWorldModelEnv(url, **arguments)
