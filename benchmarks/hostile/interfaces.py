@@ -5,10 +5,11 @@ from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 
-from benchmarks.hostile.cases import Case, Ended, Place, call
+from benchmarks.hostile.cases import Began, Case, Ended, Place, call
 
 NAN = float("nan")
 FILE = object()  # stands for the path of a file in a case's own folder
@@ -60,6 +61,7 @@ DOCUMENTED = {
     "environments: make, data_dir = an existing file": "clips are looked for at reset",
     "environments: make, store = an existing file": "clips are looked for at reset",
     "environments: make, store = None": "no other store",
+    "environments: make, depth = True": "the default",
     "environments: *, split = a* *": "splits are looked up at reset",
     "environments: *, judge = None": "no judge, so every reward is 0",
     "environments: *, judge = a function": "any function of frames is a judge",
@@ -294,9 +296,12 @@ def _of_class(kind: str, name: str) -> Callable[[Place, Any], object]:
 
 @cache
 def _lift() -> Any:
-    from rsjax.tools.policies.worlds.environments import LiftEnv
+    """Returns an environment with a stand-in for the simulator; an episode in it is where work begins."""
+    from rsjax.tools.policies.worlds.environments import LiftEnv, SimulatorWorld
 
-    return LiftEnv()
+    with patch.object(SimulatorWorld, "lift") as lift:
+        lift.return_value.reset.side_effect = Began("lift")
+        return LiftEnv()
 
 
 def _vector(name: str) -> Callable[[Place, Any], object]:

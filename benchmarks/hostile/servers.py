@@ -460,5 +460,6 @@ def served(material: Path) -> str:
 
     listener = listen("127.0.0.1", 0)
     world = WorldServer(PlayRun(RunData(material / "run", material / "data")), WorldServerSettings(port=0, frames=9))
-    threading.Thread(target=world.open(listener).serve_forever, daemon=True).start()
-    return f"ws://127.0.0.1:{listener.getsockname()[1]}"
+    server = world.open(listener)  # which takes the listener over
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    return f"ws://127.0.0.1:{server.socket.getsockname()[1]}"
