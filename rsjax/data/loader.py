@@ -188,16 +188,7 @@ class Loader:
     def __next__(self) -> Arrays:
         while True:
             if self._iterator is None:
-                shard = self._shard
-                rest = self._dataset[self._place + shard.shard_index :: shard.shard_count]
-                rest = rest.batch(self._batch_size // shard.shard_count, drop_remainder=True)
-                options = grain.ReadOptions(num_threads=2, prefetch_buffer_size=4)  # the buffer counts batches
-                rest = rest.to_iter_dataset(options)
-                if self._workers:
-                    absl.flags.FLAGS.mark_as_parsed()  # Grain's workers refuse to start otherwise
-                    processes = grain.MultiprocessingOptions(self._workers, per_worker_buffer_size=2)
-                    rest = rest.mp_prefetch(processes, _start_worker)
-                self._iterator = iter(rest)
+                self._iterator = iter(self._cut())
             try:
                 arrays = next(self._iterator)
                 break
@@ -216,6 +207,16 @@ class Loader:
         self._place += self._batch_size
         local = np.arange(self._batch_size // self._shard.shard_count, dtype=np.int32)
         return arrays | {"index": self._shard.shard_index + self._shard.shard_count * local}
+
+    def _cut(self) -> grain.IterDataset:
+        shard = self._shard
+        cut = self._dataset[self._place + shard.shard_index :: shard.shard_count]
+        cut = cut.batch(self._batch_size // shard.shard_count, drop_remainder=True)
+        cut = cut.to_iter_dataset(grain.ReadOptions(num_threads=2, prefetch_buffer_size=4))  # the buffer counts batches
+        if not self._workers:
+            return cut
+        absl.flags.FLAGS.mark_as_parsed()  # Grain's workers refuse to start otherwise
+        return cut.mp_prefetch(grain.MultiprocessingOptions(self._workers, per_worker_buffer_size=2), _start_worker)
 
     def __enter__(self) -> Self:
         return self

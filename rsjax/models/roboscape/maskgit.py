@@ -6,6 +6,7 @@ Axes: B clips, S cells, D code bits, n vocabularies of V codes.
 """
 
 import math
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -106,36 +107,39 @@ def unmask_step(
         no_depth: True for clips without depth, whose depth tokens are meaningless.
         temperature: one per clip, above 0, instead of that of ``config`` unless that is 0.
     """
+    return jax.vmap(partial(_unmask_clip, config, code_bits, step))(keys, frame, logits, no_depth, temperature)
 
-    def unmask_clip(
-        key: Array,
-        frame: Frame,
-        logits: dict[str, Array],
-        no_depth: Array | None,
-        temperature: float | Array | None,
-    ) -> Frame:
-        order_key, rgb_key, depth_key = jax.random.split(key, 3)
-        # RGB's draws are the same where the others are left out.
-        branch_keys = {"rgb": rgb_key, "depth": depth_key, SECOND: jax.random.fold_in(key, 3)}
-        tokens = {}
-        confidence = jnp.zeros(frame.mask.shape)
-        entropy = frame.entropy
-        if temperature is None or config.temperature == 0:
-            temperature = config.temperature
-        if entropy is not None:
-            entropy = jnp.where(frame.mask, token_entropy(logits["rgb"]), entropy)
-        for branch, branch_logits in logits.items():
-            drawn, log_p = sample_tokens(branch_keys[branch], branch_logits, temperature, code_bits, config.top_k)
-            tokens[branch] = jnp.where(frame.mask, drawn, frame.tokens[branch])
-            if branch == "depth" and no_depth is not None:
-                log_p = jnp.where(no_depth, 0.0, log_p)
-            confidence += log_p
-        means = mean_codes.decided(frame.mask, logits, frame.means, code_bits)
-        if config.unmask == "random":
-            confidence = jax.random.uniform(order_key, frame.mask.shape)
-        # Cells that are already decided stay decided: they get the highest rank.
-        rank = jnp.argsort(jnp.argsort(jnp.where(frame.mask, confidence, jnp.inf)))
-        still_masked = rank < jnp.asarray(masked_after(config.steps, frame.mask.shape[-1]))[step]
-        return Frame(tokens, still_masked, entropy, means)
 
-    return jax.vmap(unmask_clip)(keys, frame, logits, no_depth, temperature)
+def _unmask_clip(
+    config: SampleConfig,
+    code_bits: int,
+    step: Array | int,
+    key: Array,
+    frame: Frame,
+    logits: dict[str, Array],
+    no_depth: Array | None,
+    temperature: float | Array | None,
+) -> Frame:
+    order_key, rgb_key, depth_key = jax.random.split(key, 3)
+    # RGB's draws are the same where the others are left out.
+    branch_keys = {"rgb": rgb_key, "depth": depth_key, SECOND: jax.random.fold_in(key, 3)}
+    tokens = {}
+    confidence = jnp.zeros(frame.mask.shape)
+    entropy = frame.entropy
+    if temperature is None or config.temperature == 0:
+        temperature = config.temperature
+    if entropy is not None:
+        entropy = jnp.where(frame.mask, token_entropy(logits["rgb"]), entropy)
+    for branch, branch_logits in logits.items():
+        drawn, log_p = sample_tokens(branch_keys[branch], branch_logits, temperature, code_bits, config.top_k)
+        tokens[branch] = jnp.where(frame.mask, drawn, frame.tokens[branch])
+        if branch == "depth" and no_depth is not None:
+            log_p = jnp.where(no_depth, 0.0, log_p)
+        confidence += log_p
+    means = mean_codes.decided(frame.mask, logits, frame.means, code_bits)
+    if config.unmask == "random":
+        confidence = jax.random.uniform(order_key, frame.mask.shape)
+    # Cells that are already decided stay decided: they get the highest rank.
+    rank = jnp.argsort(jnp.argsort(jnp.where(frame.mask, confidence, jnp.inf)))
+    still_masked = rank < jnp.asarray(masked_after(config.steps, frame.mask.shape[-1]))[step]
+    return Frame(tokens, still_masked, entropy, means)

@@ -267,28 +267,30 @@ def renewed(arch: Architecture, sample: SampleConfig, params: Params, state: Sta
         state: of B clips, or a stack of N states of one clip.
         full: whether the window is full; of a stack, each window.
     """
-
-    def renew_window(state: State, full: Bool[Array, ""]) -> State:
-        """Encodes the frames that stay in a full window from position 0 on."""
-        kept = arch.frames - stride(arch, sample)
-        newest = slice(-kept, None)
-        base = state.actions[:, -kept]
-        cache = state.cache
-        if encoded := kept - arch.uncommitted:
-            read = mean_codes.read(sample, state.tokens, state.means)
-            seen = {branch: x[:, newest][:, :encoded] for branch, x in read.items()}
-            rows = window_actions(arch, state.actions[:, newest][:, :encoded], base, 0)
-            mask = jnp.zeros(seen["rgb"].shape[:3], bool)
-            _, cache, _ = apply_network(arch, sample, params, seen, mask, rows, 0, cache, state.no_depth)
-        moved = replace(state, base=base, cache=cache, position=jnp.full_like(state.position, kept))
-        return where(full, moved, state)
-
-    renew: Any = renew_window
+    renew: Any = partial(_renew_window, arch, sample, params)
     if state.position.ndim > 0:
         axes = clip_axes(state)
         renew = jax.vmap(renew, (axes, 0), axes)
     moved: State = renew(state, full)
     return moved
+
+
+def _renew_window(
+    arch: Architecture, sample: SampleConfig, params: Params, state: State, full: Bool[Array, ""]
+) -> State:
+    """Encodes the frames that stay in a full window from position 0 on."""
+    kept = arch.frames - stride(arch, sample)
+    newest = slice(-kept, None)
+    base = state.actions[:, -kept]
+    cache = state.cache
+    if encoded := kept - arch.uncommitted:
+        read = mean_codes.read(sample, state.tokens, state.means)
+        seen = {branch: x[:, newest][:, :encoded] for branch, x in read.items()}
+        rows = window_actions(arch, state.actions[:, newest][:, :encoded], base, 0)
+        mask = jnp.zeros(seen["rgb"].shape[:3], bool)
+        _, cache, _ = apply_network(arch, sample, params, seen, mask, rows, 0, cache, state.no_depth)
+    moved = replace(state, base=base, cache=cache, position=jnp.full_like(state.position, kept))
+    return where(full, moved, state)
 
 
 def where(which: Bool[Array, ""], new: State, old: State) -> State:

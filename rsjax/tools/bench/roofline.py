@@ -79,32 +79,7 @@ def roofline(config: Config, batch: int, ceiling: float, budget: float) -> dict[
     if not isinstance(model, RoboScape):
         return {}
     speed = bandwidth(budget)
-
-    def measure(operation: Operation, gradient: bool = True) -> tuple[float, float]:
-        """Returns seconds and least seconds of an operation in all its places, with its gradient or without."""
-        keys = jax.random.split(jax.random.key(0), len(operation.shapes))
-        operands = [jax.random.normal(key, shape) for key, shape in zip(keys, operation.shapes, strict=True)]
-
-        @jax.jit
-        def both(cotangent: Any, *operands: Any) -> Any:
-            out, pull = jax.vjp(operation.run, *operands)
-            return out, pull(cotangent)
-
-        out = jax.eval_shape(operation.run, *operands)
-        forward = jax.jit(operation.run)
-        cotangent = jnp.ones(out.shape, out.dtype)
-        run = partial(forward, *operands)
-        passes = 1
-        if gradient:
-            run = partial(both, cotangent, *operands)
-            passes = 3
-        seconds = median_seconds(run, budget)
-        read = sum(x.size for x in operands)
-        # Forward moves operands and result; the gradient moves operands, the result's gradient and the operands'.
-        moved = FLOAT * (read + out.size + (gradient and not operation.passes_on) * (2 * read + out.size))
-        products = passes * operation.flops
-        return operation.times * seconds, operation.times * max(products / ceiling, moved / speed)
-
+    measure = partial(_measure, ceiling=ceiling, speed=speed, budget=budget)
     step = {each.name: measure(each) for each in operations(model.architecture, config, batch)}
     step["optimizer"] = _optimizer(config, model, speed, budget)
     numbers: dict[str, Any] = {"roofline_bandwidth_bytes_per_s": speed} | _rows("roofline", step)
@@ -279,6 +254,34 @@ def pass_flops(arch: Architecture, cache: StackedCache) -> int:
     """Returns the floating-point operations of a pass over one frame that attends to the cache and to itself."""
     _, clips, _, _, slots, _ = cache["rgb"].k.shape
     return clips * forward_flops(arch, slots + 1) // (slots + 1)
+
+
+def _measure(
+    operation: Operation, ceiling: float, speed: float, budget: float, gradient: bool = True
+) -> tuple[float, float]:
+    """Returns seconds and least seconds of an operation in all its places, with its gradient or without."""
+    keys = jax.random.split(jax.random.key(0), len(operation.shapes))
+    operands = [jax.random.normal(key, shape) for key, shape in zip(keys, operation.shapes, strict=True)]
+
+    @jax.jit
+    def both(cotangent: Any, *operands: Any) -> Any:
+        out, pull = jax.vjp(operation.run, *operands)
+        return out, pull(cotangent)
+
+    out = jax.eval_shape(operation.run, *operands)
+    forward = jax.jit(operation.run)
+    cotangent = jnp.ones(out.shape, out.dtype)
+    run = partial(forward, *operands)
+    passes = 1
+    if gradient:
+        run = partial(both, cotangent, *operands)
+        passes = 3
+    seconds = median_seconds(run, budget)
+    read = sum(x.size for x in operands)
+    # Forward moves operands and result; the gradient moves operands, the result's gradient and the operands' gradients.
+    moved = FLOAT * (read + out.size + (gradient and not operation.passes_on) * (2 * read + out.size))
+    products = passes * operation.flops
+    return operation.times * seconds, operation.times * max(products / ceiling, moved / speed)
 
 
 def _optimizer(config: Config, model: RoboScape, speed: float, budget: float) -> tuple[float, float]:

@@ -80,36 +80,43 @@ def find(name: str) -> Target:
         if parts is None:
             continue
         if card.platform == "tpu":
-            slices = SLICES[family]
-            size = int(parts[1] or min(slices))
-            if size not in slices:
-                names = [f"{family}-{size}" for size in slices]
-                raise ConfigError(f"target {name!r} is no slice of {card.title}; slices: {', '.join(names)}")
-            shape = slices[size]
-            chips = 1
-            for side in shape.split("x"):
-                chips *= int(side)
-            local = min(chips, 4)
-            if slices is _FLAT and chips == 8:
-                local = 8  # one host of 8 chips
-            return Target(name, card, chips // local, local, shape)
-        gpus = int(parts[1] or 1)
-        local = max(1, min(gpus, GPUS_PER_HOST))
-        if gpus == 0 or gpus % local:
-            raise ConfigError(
-                f"target {name!r}: a host has up to {GPUS_PER_HOST} cards, so several hosts have a multiple of them; "
-                f"did you mean '{family}x{max(1, gpus // GPUS_PER_HOST * GPUS_PER_HOST)}'?"
-            )
-        return Target(name, card, gpus // local, local)
-    gpu_names = [name for name, card in CARDS.items() if card.platform == "cuda"]
-    clusters = [f"{gpu}x{size}" for gpu in gpu_names for size in (2, 4, 8, 16, 64)]
-    slice_names = [f"{family}-{size}" for family, sizes in SLICES.items() for size in sizes]
-    near = did_you_mean(name, [*CARDS, *clusters, *slice_names])
+            return _slice(name, family, parts[1])
+        return _gpus(name, family, int(parts[1] or 1))
+    gpus = [name for name, card in CARDS.items() if card.platform == "cuda"]
+    slices = [f"{family}-{size}" for family, sizes in SLICES.items() for size in sizes]
+    near = did_you_mean(name, [*CARDS, *(f"{gpu}x{size}" for gpu in gpus for size in (2, 4, 8, 16, 64)), *slices])
     named = [
-        *(f"{gpu}, {gpu}xN" for gpu in gpu_names),
+        *(f"{gpu}, {gpu}xN" for gpu in gpus),
         *(f"{tpu}-{min(each)} to -{max(each)}" for tpu, each in SLICES.items()),
     ]
     raise ConfigError(f"target {name!r} is not known{near}; targets: {', '.join(named)}")
+
+
+def _gpus(name: str, family: str, devices: int) -> Target:
+    local = max(1, min(devices, GPUS_PER_HOST))
+    if devices == 0 or devices % local:
+        raise ConfigError(
+            f"target {name!r}: a host has up to {GPUS_PER_HOST} cards, so several hosts have a multiple of them; "
+            f"did you mean '{family}x{max(1, devices // GPUS_PER_HOST * GPUS_PER_HOST)}'?"
+        )
+    return Target(name, CARDS[family], devices // local, local)
+
+
+def _slice(name: str, family: str, number: str | None) -> Target:
+    """Returns a slice of a TPU; without a number the smallest one."""
+    slices = SLICES[family]
+    size = int(number or min(slices))
+    if size not in slices:
+        names = [f"{family}-{size}" for size in slices]
+        raise ConfigError(f"target {name!r} is no slice of {CARDS[family].title}; slices: {', '.join(names)}")
+    shape = slices[size]
+    chips = 1
+    for side in shape.split("x"):
+        chips *= int(side)
+    local = min(chips, 4)
+    if slices is _FLAT and chips == 8:
+        local = 8  # one host of 8 chips
+    return Target(name, CARDS[family], chips // local, local, shape)
 
 
 def devices(target: Target) -> list[Any]:

@@ -105,25 +105,7 @@ class Routes:
             count = 0
         if first < 0 or not 0 < count <= MOST_CLIPS:
             return _refused(400, "bad_message", f"first is 0 or more, count is from 1 to {MOST_CLIPS}")
-
-        def listed() -> dict[str, Any]:
-            run = self._hub.run
-            clips = []
-            for number in range(first, min(first + count, run.clips)):
-                try:
-                    clip = run.clip(number)
-                except Refused:
-                    continue
-                labelled = run.store is not None and run.store.manifest.get("success_share") is not None
-                if labelled:
-                    success = bool(clip["success"][-1])
-                else:
-                    success = None
-                facts = {"clip": number, "task": str(clip["task"]), "frames": len(clip["rgb"]), "success": success}
-                clips.append(facts)
-            return {"split": run.split, "total": run.clips, "clips": clips}
-
-        return JSONResponse(await asyncio.to_thread(listed))
+        return JSONResponse(await asyncio.to_thread(self._list, first, count))
 
     async def clip(self, request: Request) -> Response:
         if refused := self._known(request):
@@ -154,6 +136,23 @@ class Routes:
             await socket.close(4401, "the address lacks the token that the server printed")
         else:
             await Connection(socket, self._hub).serve(socket.query_params.get("session"))
+
+    def _list(self, first: int, count: int) -> dict[str, Any]:
+        run = self._hub.run
+        clips = []
+        for number in range(first, min(first + count, run.clips)):
+            try:
+                clip = run.clip(number)
+            except Refused:
+                continue
+            labelled = run.store is not None and run.store.manifest.get("success_share") is not None
+            if labelled:
+                success = bool(clip["success"][-1])
+            else:
+                success = None
+            facts = {"clip": number, "task": str(clip["task"]), "frames": len(clip["rgb"]), "success": success}
+            clips.append(facts)
+        return {"split": run.split, "total": run.clips, "clips": clips}
 
     def _file(self, name: str) -> Response:
         path = self._page.get(name)

@@ -101,11 +101,15 @@ def merge_result(path: Path, study: Path) -> None:
     counts.
 
     Raises:
-        FileError: a file is missing or damaged, or the two differ in what they compare or in the sizes of trainings.
+        FileError: a file is missing or damaged, or the two differ in what they compare, or in the preset or sizes of
+            trainings.
     """
+    ours = read_result(path)
+    theirs = read_result(study)
     before = read_json(path)
     after = read_json(study)
     for what, one, other in (
+        ("presets", before["preset"], after["preset"]),
         ("claims", before["claim"]["comparisons"], after["claim"]["comparisons"]),
         ("arms", [arm["name"] for arm in before["arms"]], [arm["name"] for arm in after["arms"]]),
         ("sizes of trainings", before["sizes"], after["sizes"]),
@@ -114,8 +118,6 @@ def merge_result(path: Path, study: Path) -> None:
             raise FileError(
                 f"{study}: its {what} differ from those of {path}; add it without --merge or by another --name"
             )
-    ours = read_result(path)
-    theirs = read_result(study)
     arms = [merge_arms(one, other) for one, other in zip(ours.arms, theirs.arms, strict=True)]
     about = {name: after[name] for name in ("command", "preset", "budget", "sizes")}
     about |= {name: list(dict.fromkeys([*before[name], *after[name]])) for name in ("commits", "machines")}

@@ -169,9 +169,13 @@ def test_seeds_of_two_machines_are_judged_as_those_of_one(tmp_path: Path, clips:
     result_files.merge_result(nothing_yet, theirs)
     assert result_files.read_result(nothing_yet).arms[0].seeds == arms[0].seeds[1:]
     before = ours.read_bytes()
-    with pytest.raises(result_files.FileError) as error:
-        result_files.merge_result(ours, written("larger", sizes={"episodes": 10}))
-    assert "sizes of trainings differ" in str(error.value) and ours.read_bytes() == before
+    for what, other in {"sizes of trainings": {"sizes": {"episodes": 10}}, "presets": {"preset": "multitask"}}.items():
+        with pytest.raises(result_files.FileError) as error:
+            result_files.merge_result(ours, written("other", **other))
+        assert f"its {what} differ" in str(error.value) and ours.read_bytes() == before
+    (tmp_path / "printed.json").write_text('{"kind": "transcribed", "tables": {}}')
+    with pytest.raises(result_files.FileError):
+        result_files.merge_result(tmp_path / "printed.json", theirs)
 
 
 def test_a_damaged_file_is_one_line(tmp_path: Path) -> None:
