@@ -141,18 +141,7 @@ class Checkpoints:
         except Exception as error:  # orbax reports a mismatch as errors of many types
             raise _misfit(self.directory / str(step), error) from error
         if faults and not self._read_only:
-
-            def set_aside() -> None:
-                for bad, fault in faults:
-                    aside = self.directory / f"bad-{bad}"
-                    shutil.rmtree(aside, ignore_errors=True)
-                    os.replace(self.directory / str(bad), aside)
-                    note(f"checkpoint {bad} is damaged ({fault}): resuming from that of step {step}; kept as {aside}")
-
-            with disk_guard(self.directory):
-                on_lead("moving a damaged checkpoint", set_aside)
-                self._manager.close()
-                self._manager = self._open()
+            self._set_aside(faults, step)
         return restored["state"], restored["data"]
 
     def wait(self) -> None:
@@ -215,6 +204,19 @@ class Checkpoints:
                 return agree((step, faults), "checkpoints")
             faults.append((step, fault))
         return agree((None, faults), "checkpoints")
+
+    def _set_aside(self, faults: list[tuple[int, str]], instead: int) -> None:
+        def move() -> None:
+            for step, fault in faults:
+                aside = self.directory / f"bad-{step}"
+                shutil.rmtree(aside, ignore_errors=True)
+                os.replace(self.directory / str(step), aside)
+                note(f"checkpoint {step} is damaged ({fault}): resuming from that of step {instead}; kept as {aside}")
+
+        with disk_guard(self.directory):
+            on_lead("moving a damaged checkpoint", move)
+            self._manager.close()
+            self._manager = self._open()
 
 
 def save_weights(path: Path, weights: PyTree) -> None:

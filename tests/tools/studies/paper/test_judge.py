@@ -169,7 +169,11 @@ def test_seeds_of_two_machines_are_judged_as_those_of_one(tmp_path: Path, clips:
     result_files.merge_result(nothing_yet, theirs)
     assert result_files.read_result(nothing_yet).arms[0].seeds == arms[0].seeds[1:]
     before = ours.read_bytes()
-    for what, other in {"sizes of trainings": {"sizes": {"episodes": 10}}, "presets": {"preset": "multitask"}}.items():
+    differing: dict[str, dict[str, Any]] = {
+        "sizes of trainings": {"sizes": {"episodes": 10}},
+        "presets": {"preset": "multitask"},
+    }
+    for what, other in differing.items():
         with pytest.raises(result_files.FileError) as error:
             result_files.merge_result(ours, written("other", **other))
         assert f"its {what} differ" in str(error.value) and ours.read_bytes() == before
