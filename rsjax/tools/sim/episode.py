@@ -95,6 +95,7 @@ class EpisodePlan:
         replay: actions that replace the expert's.
         manner: that of the expert; None: one is drawn.
         seed: replaces the configuration's.
+        lead: frames of the episode that pass before the clip's first one.
     """
 
     name: str
@@ -104,6 +105,7 @@ class EpisodePlan:
     replay: Replay | None = None
     manner: Manner | None = None
     seed: int | None = None
+    lead: int = 0
 
 
 @dataclass(frozen=True)
@@ -190,7 +192,8 @@ def task_of(config: SimConfig, episode: int) -> str:
 def run_episode(sim: Simulator, config: SimConfig, plan: EpisodePlan) -> Clip:
     """Simulates one episode, which depends only on the configuration and the plan.
 
-    Frame 0 is the initial state; ``config.control_steps`` control steps lead to each later frame.
+    Frame 0 is the initial state, or that after ``plan.lead`` frames; ``config.control_steps`` control steps lead to each
+    later frame.
     """
     episode = plan.episode
     seed = config.seed
@@ -211,6 +214,8 @@ def run_episode(sim: Simulator, config: SimConfig, plan: EpisodePlan) -> Clip:
     if plan.replay:
         act = _replayed(plan.replay, CONTROLS[config.env], np.random.default_rng([seed, episode, 4]))
         manner = plan.replay.expert or manner
+    for _ in range(plan.lead * config.control_steps):
+        sim.step(act(sim.state))
     views = []
     seconds = []
     shots = []
@@ -254,6 +259,8 @@ def run_episode(sim: Simulator, config: SimConfig, plan: EpisodePlan) -> Clip:
         provenance["difficulty"] = "simple"
     else:
         provenance["difficulty"] = "difficult"
+    if plan.lead:
+        provenance["lead"] = plan.lead
     if plan.replay:
         provenance["replay"] = {"jitter": plan.replay.jitter}
     if plan.change:

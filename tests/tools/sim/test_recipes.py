@@ -64,6 +64,18 @@ def test_a_recipe_gives_clips_with_finite_labels_that_depend_on_the_seed_alone(s
     assert clip_seed(clip.provenance) == int(rng.integers(2**32))
 
 
+def test_a_clip_that_begins_midway_is_the_end_of_the_whole_episode(sim: LiftSim) -> None:
+    plan = replace(scripted(CONFIG, "midway", 1, "1"), lead=2)
+    clip = run_episode(sim, CONFIG, plan)
+    whole = run_episode(sim, replace(CONFIG, frames=5), replace(plan, lead=0))
+    np.testing.assert_array_equal(clip.rgb, whole.rgb[2:])
+    np.testing.assert_array_equal(clip.actions[1:], whole.actions[3:])
+    assert clip.provenance["lead"] == 2 and "lead" not in whole.provenance
+    leads = [scripted(CONFIG, "midway", place, "1").lead for place in range(40)]
+    assert 2 <= min(leads) < 10 and 30 < max(leads) <= 40
+    assert {scripted(CONFIG, name, 1, "1").lead for name in RECIPES if name != "midway"} == {0}
+
+
 def test_grasps_of_a_group_share_start_and_approach_and_about_half_succeed(sim: LiftSim) -> None:
     plans = [scripted(CONFIG, "grasps", place, f"{place}") for place in range(12 * GROUP)]
     success = []

@@ -10,7 +10,7 @@ import numpy as np
 from rsjax.config import SimConfig
 from rsjax.config.sim import EXPERT, RECORDED
 from rsjax.tools.sim.episode import EpisodePlan, Manner, task_of
-from rsjax.tools.sim.recipes import driving, grasps, novices, pushes, slips
+from rsjax.tools.sim.recipes import driving, grasps, midway, novices, pushes, slips
 from rsjax.tools.sim.recipes.recorded import recorded
 
 HELD_OUT = 5_000_000  # added to the numbers of episodes that training never sees
@@ -24,12 +24,14 @@ class Recipe:
         draw: returns the manner of an episode, given a generator and the episode's place among those of the recipe.
         first: number of its first episode, which with the seed determines start and draws.
         group: how many successive episodes have one number, so that they share start and draws.
+        lead: bounds of the frames that pass before a clip's first one.
         version: raise it when the same configuration gives different episodes.
     """
 
     draw: Callable[[np.random.Generator, int], Manner]
     first: int
     group: int = 1
+    lead: tuple[int, int] = (0, 0)
     version: int = 1
 
 
@@ -39,6 +41,7 @@ RECIPES = {
     "slips": Recipe(slips.slips, 30_000_000),
     "driving": Recipe(driving.driving, 40_000_000),
     "novices": Recipe(novices.novices, 50_000_000),
+    "midway": Recipe(midway.midway, 60_000_000, lead=midway.LEAD),
 }
 
 
@@ -80,4 +83,5 @@ def scripted(config: SimConfig, recipe: str, place: int, name: str, after: int =
     entry = RECIPES[recipe]
     episode = entry.first + after + place // entry.group
     rng = np.random.default_rng([config.seed, episode, 5])
-    return EpisodePlan(name, episode, manner=entry.draw(rng, place))
+    manner = entry.draw(rng, place)
+    return EpisodePlan(name, episode, manner=manner, lead=int(rng.integers(*entry.lead, endpoint=True)))
