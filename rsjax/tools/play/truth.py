@@ -18,7 +18,7 @@ from rsjax.processes import Helper, WorkerDied
 from rsjax.tools.play.messages import Refused
 from rsjax.tools.play.simulate import Job, Rendered, Simulate, simulate
 from rsjax.tools.play.tree import Node, Truth
-from rsjax.tools.sim.episode import clip_seed
+from rsjax.tools.sim.episode import WINDOW, clip_seed
 
 SECONDS = 120.0  # time limit for a step or for the simulator's start
 MOST = 2  # simulators of a server
@@ -60,10 +60,12 @@ class Follower:
     """A simulator that follows one viewer's branches.
 
     Raises:
-        Refused: all simulators are in use.
+        Refused: all simulators are in use, or the clip begins later than its episode.
     """
 
     def __init__(self, truths: Truths, origin: dict[str, Any], task: str) -> None:
+        if origin.get(WINDOW):  # cut from an episode, and not its beginning
+            raise Refused("no_truth", "the clip begins in the middle of its episode, where the simulator cannot begin")
         self._make = truths.take()
         self._truths = truths
         self._seed = clip_seed(origin)

@@ -25,7 +25,7 @@ from rsjax.progress import Progress
 from rsjax.tools.policies.policy import Policy
 from rsjax.tools.policies.worlds.world import World
 from rsjax.tools.sim.collect import Collection, make_store
-from rsjax.tools.sim.episode import POLICY, EpisodePlan, Replay, clip_seed
+from rsjax.tools.sim.episode import POLICY, WINDOW, EpisodePlan, Replay, clip_seed
 from rsjax.tools.sim.unseen import UNITS
 
 FIRST_EPISODE = 2**20  # the numbers of a run's own episodes are smaller, so none starts like one of these
@@ -164,7 +164,7 @@ def windows(record: Record, frames: int) -> list[Record]:
                 value = value[span].copy()
             clip[name] = value
         clip["actions"][0] = 0  # nothing led into the first frame
-        origin = dict(record["provenance"]) | {"window": first}
+        origin = dict(record["provenance"]) | {WINDOW: first}
         if "objects" in origin:
             places = dict(origin["objects"])
             places |= {name: at[span] for name, at in places.items() if isinstance(at, list)}

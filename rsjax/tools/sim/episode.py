@@ -18,6 +18,7 @@ from rsjax.tools.sim.scenery import SEEN, Change, Variation, draw_variation
 from rsjax.tools.sim.tracks import Snapshot, grid_pixels, object_pixels, track
 
 POLICY = "policy"  # mode of an episode in which a trained policy acted
+WINDOW = "window"  # in the provenance of a clip: the frame of its episode with which it begins; absent: the first
 
 
 class Expert(Protocol):
@@ -192,8 +193,8 @@ def task_of(config: SimConfig, episode: int) -> str:
 def run_episode(sim: Simulator, config: SimConfig, plan: EpisodePlan) -> Clip:
     """Simulates one episode, which depends only on the configuration and the plan.
 
-    Frame 0 is the initial state, or that after ``plan.lead`` frames; ``config.control_steps`` control steps lead to each
-    later frame.
+    Frame 0 is the initial state, or that after ``plan.lead`` frames; ``config.control_steps`` control steps lead to
+    each later frame.
     """
     episode = plan.episode
     seed = config.seed
@@ -260,7 +261,7 @@ def run_episode(sim: Simulator, config: SimConfig, plan: EpisodePlan) -> Clip:
     else:
         provenance["difficulty"] = "difficult"
     if plan.lead:
-        provenance["lead"] = plan.lead
+        provenance[WINDOW] = plan.lead
     if plan.replay:
         provenance["replay"] = {"jitter": plan.replay.jitter}
     if plan.change:

@@ -12,7 +12,7 @@ from rsjax.data.codec import Record
 from rsjax.data.store import Store, open_store
 from rsjax.errors import UserError
 from rsjax.tools.sim.collect import Collection, Report, make_store
-from rsjax.tools.sim.episode import EpisodePlan, Replay, source_name
+from rsjax.tools.sim.episode import WINDOW, EpisodePlan, Replay, source_name
 from rsjax.tools.sim.unseen import UNITS
 
 FOLDER = "retakes"  # inside the store's directory, so that it moves with the store
@@ -43,6 +43,11 @@ def collect_second_takes(
     if config is None or source_name(config) != clips.manifest.get("source"):
         raise UserError(f"{clips.path}: these clips were not simulated, so there is no second take of them")
     records = [clips.source(split)[number] for number in numbers]
+    if any(record["provenance"].get(WINDOW) for record in records):
+        raise UserError(
+            f"{clips.path}, split {split}: some of its clips begin in the middle of an episode, where the simulator "
+            f"cannot begin; score without second takes"
+        )
     plans = tuple(_plan(config, f"{split}-{place:06d}", record) for place, record in enumerate(records))
     key = content_key("second takes", RECIPE, str(clips.manifest.get("key")), split, tuple(map(int, numbers)), JITTER)
     meta = {name: clips.manifest[name] for name in UNITS} | {

@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from rsjax.tools.play.messages import Refused
 from rsjax.tools.play.play_run import PlayRun
-from rsjax.tools.play.truth import Truths
+from rsjax.tools.play.truth import Follower, Truths
 from tests.tools.play.client import Client, Server, serving
 from tests.tools.play.fake import Fakes, hub_of, play_run
 from tests.tools.play.fake_simulator import adding
@@ -121,3 +122,9 @@ def test_a_new_start_has_a_simulator_of_its_own(tmp_path: Path) -> None:
         told = page.until_pushed("truth", 2)
         assert [each["frame"] for each in told] == [0, 1]
         assert [int(rgb(each)[0, 0, 0]) for each in page.pictures if each.kind == 3] == [0, 10]
+
+
+def test_a_clip_from_the_middle_of_an_episode_has_no_truth() -> None:
+    with pytest.raises(Refused) as refused:
+        Follower(Truths(functools.partial(adding, 0.0)), {"seed": 0, "episode": 1, "window": 3}, "lift")
+    assert "begins in the middle of its episode" in str(refused.value)

@@ -70,7 +70,7 @@ def test_a_clip_that_begins_midway_is_the_end_of_the_whole_episode(sim: LiftSim)
     whole = run_episode(sim, replace(CONFIG, frames=5), replace(plan, lead=0))
     np.testing.assert_array_equal(clip.rgb, whole.rgb[2:])
     np.testing.assert_allclose(clip.actions[1:], whole.actions[3:], atol=1e-6)  # recorded ones are rounded
-    assert clip.provenance["lead"] == 2 and "lead" not in whole.provenance
+    assert clip.provenance["window"] == 2 and "window" not in whole.provenance
     leads = [scripted(CONFIG, "midway", place, "1").lead for place in range(40)]
     assert 2 <= min(leads) < 10 and 30 < max(leads) <= 40
     assert {scripted(CONFIG, name, 1, "1").lead for name in RECIPES if name != "midway"} == {0}

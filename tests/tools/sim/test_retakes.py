@@ -94,3 +94,12 @@ def test_clips_of_another_simulator_or_of_none_are_refused(
     plain = replace(store, manifest={k: v for k, v in store.manifest.items() if k != "config"})
     with pytest.raises(UserError, match="these clips were not simulated"):
         collect_second_takes(plain, "test", [0], 1, ignore)
+
+
+def test_clips_from_the_middle_of_an_episode_have_no_second_takes(store: Store, tmp_path: Path) -> None:
+    record = store.source("test")[0]
+    record["provenance"]["window"] = 2
+    write_store(tmp_path / "late", "clips", {"test": [record]}, store.manifest)
+    with pytest.raises(UserError) as refused:
+        collect_second_takes(open_store(tmp_path / "late"), "test", [0], 1, ignore)
+    assert "begin in the middle of an episode" in str(refused.value)

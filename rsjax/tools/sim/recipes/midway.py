@@ -1,7 +1,8 @@
 """Clips that begin in the middle of an episode: of free driving, and of a policy's attempts.
 
-All other clips begin where an episode does, with the arm at its home pose. A rollout that is longer than a clip moves its
-window of frames, and the window's first frame then shows the arm anywhere (:mod:`rsjax.models.roboscape.sample`).
+All other clips begin where an episode does, with the arm at its home pose, so that a model may take every first frame
+for that pose. A rollout that is longer than a clip moves its window of frames, and the window's first frame then shows
+the arm anywhere (:mod:`rsjax.models.roboscape.sample`).
 """
 
 from dataclasses import replace
