@@ -21,6 +21,7 @@ from rsjax.config import (
     RuntimeConfig,
     SampleConfig,
     SimConfig,
+    StateHeadsConfig,
     TokenizerConfig,
     TokenizerTrainConfig,
     TrainConfig,
@@ -71,9 +72,12 @@ def tiny() -> Config:
 
 
 def tiny_policies() -> Config:
-    """Trains the package's ``tiny`` further, on clips in which position decides: for policies (docs/contacts.md)."""
+    """Trains the package's ``tiny`` further, on clips in which position decides: for policies (docs/contacts.md).
+
+    It also learns to read success and the state of the scene.
+    """
     small = tiny()
-    recipe = ("expert=0.25", "grasps=0.5", "driving=0.15", "novices=0.05", "slips=0.05")
+    recipe = ("expert=0.2", "grasps=0.35", "driving=0.05", "midway=0.3", "novices=0.05", "slips=0.05")
     model = small.model
     assert isinstance(model, RoboScapeConfig)
     return replace(
@@ -81,8 +85,12 @@ def tiny_policies() -> Config:
         name="tiny_policies",
         sim=replace(small.sim, episodes=1600, recipe=recipe),
         tokenizer_train=replace(small.tokenizer_train, start_from="tiny", steps=0),
-        # It has learned to read its own frames.
-        model=replace(model, departures=replace(model.departures, self_conditioning_after=0)),
+        model=replace(
+            model,
+            # It has learned to read its own frames.
+            departures=replace(model.departures, self_conditioning_after=0),
+            state_heads=StateHeadsConfig(),
+        ),
         train=replace(
             small.train, start_from="tiny", steps=2500, optimizer=replace(small.train.optimizer, learning_rate=3e-3)
         ),
