@@ -149,7 +149,8 @@ def roboscape_tiny() -> Config:
             ),
             compute_dtype="bfloat16",
             corruption=None,
-            sample=SampleConfig(steps=1, mean_codes=True, read_means=True),
+            # Every episode begins with the arm at rest.
+            sample=SampleConfig(steps=1, mean_codes=True, read_means=True, sums="clip"),
         ),
         train=TrainConfig(
             steps=1700,

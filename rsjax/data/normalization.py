@@ -113,6 +113,11 @@ class Normalization:
         scaled[..., 0, :] = 0.0
         return with_sums(scaled, np.cumsum(scaled, axis=-2) if integrate else None)
 
+    def resting(self) -> Float32[np.ndarray, " A2"]:
+        """Returns the inputs of the action encoder, with sums, of one frame after the first in which actions are 0."""
+        still = np.zeros((2, len(self.action_mean)))
+        return self.action_inputs(still, integrate=True)[1]
+
     def scaled(self, actions: Float[np.ndarray, "*B A"]) -> Float64[np.ndarray, "*B A"]:
         """Returns actions scaled to zero mean and unit variance.
 

@@ -27,7 +27,7 @@ from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.departures import mean_codes
 from rsjax.models.roboscape.departures.keep_still import keep_still
 from rsjax.models.roboscape.departures.second_view import views
-from rsjax.models.roboscape.sample import State, start, step, with_few_launches
+from rsjax.models.roboscape.sample import State, resting_actions, start, step, with_few_launches
 from rsjax.models.roboscape.transformer import Cache
 from rsjax.tokenizers.codec import Codec
 from rsjax.tokenizers.magvit2 import for_many_pictures, run_tokenizer
@@ -178,7 +178,8 @@ class TokenBranching:
         """Returns the state of one clip after its first frame."""
         hidden = jnp.ones(1, bool) if self._arch.depth != "none" and not self._has_depth else None
         actions = jnp.zeros((1, 1, self._arch.action_inputs))
-        state: State = self._place(_start(self._arch, sample, self._params, tokens, actions, None, hidden))
+        resting = resting_actions(self._arch, sample, self._codec.normalization)
+        state: State = self._place(_start(self._arch, sample, self._params, tokens, actions, None, hidden, resting))
         return state
 
     def _branch_state(self, memory: _Memory, rgb: UInt8[np.ndarray, "H W 3"]) -> BranchState:

@@ -30,6 +30,7 @@ from rsjax.models.roboscape.sample import (
     clip_axes,
     for_many_passes,
     renewed,
+    resting_actions,
     start,
     step,
     stride,
@@ -103,7 +104,9 @@ class TokenImagination:
                 continue
             these = rows[lanes]
             cells = {name: grid[these] for name, grid in tokens.items()}
-            fresh = _start(self._arch, self._config.sample, self._params, cells, draws[these], hidden)
+            sample = self._config.sample
+            resting = resting_actions(self._arch, sample, self._codec.normalization)
+            fresh = _start(self._arch, sample, self._params, cells, draws[these], hidden, resting)
             if old is None:
                 self._states[number] = fresh
             else:
@@ -184,6 +187,7 @@ def _start(
     tokens: dict[str, Int[Array, "B 1 S"]],
     index: Int[Array, " B"],
     no_depth: Bool[Array, " B"] | None,
+    resting: Float[Array, " A"] | None,
 ) -> State:
     """Returns a stack of states, one for each clip, after first frames; ``index`` decides each clip's draws."""
     actions = jnp.zeros((1, 1, arch.action_inputs))
@@ -192,7 +196,7 @@ def _start(
     def start_clip(tokens: dict[str, Array], key: Array, no_depth: Array | None) -> State:
         cells = {name: x[None] for name, x in tokens.items()}
         hidden = None if no_depth is None else no_depth[None]
-        return start(arch, sample, params, cells, actions, key[None], hidden)
+        return start(arch, sample, params, cells, actions, key[None], hidden, resting)
 
     stacked: State = jax.vmap(start_clip, out_axes=CLIPS)(tokens, keys, no_depth)
     return replace(stacked, cache=unstack_params(stacked.cache, arch.groups, arch.unroll))

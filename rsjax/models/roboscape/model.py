@@ -36,7 +36,7 @@ from rsjax.models.roboscape.departures.whole_frames import hidden
 from rsjax.models.roboscape.flops import forward_flops, motion_head_flops
 from rsjax.models.roboscape.imagine import TokenImagination
 from rsjax.models.roboscape.objective import Batch
-from rsjax.models.roboscape.sample import Decoded, Tokens, encode_prompt, rollout, rollout_from
+from rsjax.models.roboscape.sample import Decoded, Tokens, encode_prompt, resting_actions, rollout, rollout_from
 from rsjax.models.roboscape.teacher_forcing import score_tokens
 from rsjax.models.roboscape.transformer import Transformer, empty_cache, run_transformer, run_with_trunk
 from rsjax.progress import note
@@ -182,7 +182,8 @@ class RoboScape(WorldModel[Batch]):
         tokens, has_depth = self._tokens(assets, prompt, arch)
         tokens, inputs = divide((tokens, self._action_inputs(assets, actions)), params)
         key = jax.random.key(sample.seed)
-        made = rollout(arch, sample, params, tokens, inputs, key, index=index, no_depth=~has_depth)
+        resting = resting_actions(arch, sample, assets.normalization)
+        made = rollout(arch, sample, params, tokens, inputs, key, index=index, no_depth=~has_depth, resting=resting)
         return self._video(assets, made, has_depth & depth, prompt, tokens)
 
     def plan(
@@ -207,7 +208,8 @@ class RoboScape(WorldModel[Batch]):
             raise ValueError(f"the candidates' actions differ in rows before {past}, which led into the one prompt")
         tokens, has_depth = self._tokens(assets, prompt, arch)
         inputs = self._action_inputs(assets, actions)
-        encoded = encode_prompt(arch, sample, params, tokens, inputs[:1, :past], no_depth=~has_depth)
+        resting = resting_actions(arch, sample, assets.normalization)
+        encoded = encode_prompt(arch, sample, params, tokens, inputs[:1, :past], ~has_depth, resting)
         same_draws = jnp.zeros(candidates, jnp.int32)
         key = jax.random.key(sample.seed)
         made = rollout_from(arch, sample, params, encoded, inputs[:, past:], key, same_draws)
@@ -235,7 +237,9 @@ class RoboScape(WorldModel[Batch]):
         if "depth" in arch.modalities and "depth" not in tokens:
             tokens["depth"] = jnp.zeros_like(tokens["rgb"])
         tokens, inputs = divide((tokens, self._action_inputs(assets, actions)), params)
-        return score_tokens(arch, self.config.sample, params, tokens, inputs, ~has_depth, prompt_frames)
+        sample = self.config.sample
+        resting = resting_actions(arch, sample, assets.normalization)
+        return score_tokens(arch, sample, params, tokens, inputs, ~has_depth, prompt_frames, resting)
 
     def pretrained_shapes(self, directory: Path) -> Params:
         return pretrained.shapes(self.architecture, directory)

@@ -26,6 +26,7 @@ from jaxtyping import Bool, Float, Int, Key
 
 from rsjax.clip import Array
 from rsjax.config import SampleConfig
+from rsjax.data.normalization import Normalization
 from rsjax.layers.dense import rounded
 from rsjax.layers.platform import where_launches_take_long
 from rsjax.layers.unstacked_params import stack_params, unstack_params
@@ -52,7 +53,7 @@ class State:
         tokens: of the last K frames by branch.
         means: mean codes of these frames; empty unless ``sample.shows_means``.
         actions: those that lead into these frames, as in a whole clip's inputs (sums since its first frame).
-        base: those that lead into the window's first frame.
+        base: those that lead into the window's first frame, or with ``resting`` as many frames of rest as have left it.
         cache: of the window's frames except the last ``Architecture.uncommitted``.
         position: the next frame's position in its window.
         frame: the next frame's number in its clip.
@@ -64,6 +65,7 @@ class State:
         readings: what the state heads read from the last frame; None: the model has none.
         features: the RGB branch's features of the last frame in its first pass, which sees none of its cells, as means
             over the cells; None: not requested.
+        resting: the actions of a frame of rest; None: sums begin at the window's first frame (``sample.sums``).
     """
 
     tokens: dict[str, Int[Array, "B K S"]]
@@ -80,6 +82,7 @@ class State:
     entropy: Float[Array, "B S"] | None = None
     readings: Float[Array, "B K"] | None = None
     features: Float[Array, "B C"] | None = None
+    resting: Float[Array, "B A"] | None = None
 
 
 # Axes of a stack of states; the blocks stay the cache's first axis.
@@ -112,17 +115,25 @@ def start(
     actions: Float[Array, "B P A"],
     key: Key[Array, " B"] | None,
     no_depth: Bool[Array, " B"] | None,
+    resting: Float[Array, " A"] | None = None,
 ) -> State:
-    """Encodes prompt frames, and returns the state before the first frame after them."""
+    """Encodes prompt frames, and returns the state before the first frame after them.
+
+    Args:
+        resting: as :func:`resting_actions` returns them.
+    """
     clips, past = tokens["rgb"].shape[:2]
     base = int(window_start(arch, sample, past))
+    if resting is not None:
+        resting = jnp.broadcast_to(resting, (len(actions), len(resting)))
+    before = sums_before(actions[:, base], base, resting)
     cache: Any = new_cache(arch, sample, clips, cache_slots(arch, past))
     known = slice(base, past - unread(arch))
     readings = None
     if known.stop > base:
         seen = {branch: cells[:, known] for branch, cells in tokens.items()}
         mask = jnp.zeros(seen["rgb"].shape, bool)
-        rows = window_actions(arch, actions[:, known], actions[:, base], 0)
+        rows = window_actions(arch, actions[:, known], before, 0)
         _, cache, trunk = apply_network(arch, sample, params, seen, mask, rows, 0, cache, no_depth)
         readings = read_state(arch, params, trunk)
 
@@ -136,13 +147,14 @@ def start(
         tokens=jax.tree.map(last, tokens),
         means=jax.tree.map(last, mean_codes.codes_of(sample, tokens, arch.code_bits)),
         actions=last(actions),
-        base=actions[:, base],
+        base=before,
         cache=cache,
         position=jnp.asarray(past - base, jnp.int32),
         frame=jnp.asarray(past, jnp.int32),
         key=key,
         no_depth=no_depth,
         readings=readings,
+        resting=resting,
     )
 
 
@@ -281,7 +293,7 @@ def _renew_window(
     """Encodes the frames that stay in a full window from position 0 on."""
     kept = arch.frames - stride(arch, sample)
     newest = slice(-kept, None)
-    base = state.actions[:, -kept]
+    base = sums_before(state.actions[:, -kept], state.frame - kept, state.resting)
     cache = state.cache
     if encoded := kept - arch.uncommitted:
         read = mean_codes.read(sample, state.tokens, state.means)
@@ -384,6 +396,33 @@ def unread(arch: Architecture) -> int:
     return arch.uncommitted
 
 
+def resting_actions(
+    arch: Architecture, sample: SampleConfig, normalization: Normalization
+) -> Float[Array, " A"] | None:
+    """Returns the actions of a frame of rest if sums begin at the clip's first frame; None: at the window's."""
+    if sample.sums == "window" or not arch.departures.integrate_actions:
+        return None
+    return jnp.asarray(normalization.resting())
+
+
+def sums_before(
+    actions: Float[Array, "B A"], left: Int[Array, ""] | int, resting: Float[Array, "*B A"] | None
+) -> Float[Array, "B A"]:
+    """Returns the ``base`` of a window, from which its sums count.
+
+    With ``resting`` the sums go on from the clip's first frame. They are sums of normalised actions, whose mean over
+    the training clips is 0, so they drift while the robot rests; frames that left the window take their drift along.
+
+    Args:
+        actions: those that lead into the window's first frame.
+        left: how many frames of the clip are before it.
+        resting: the actions of a frame of rest; None: the sums begin at the window's first frame.
+    """
+    if resting is None:
+        return actions
+    return jnp.broadcast_to(left * resting, actions.shape)
+
+
 def window_actions(
     arch: Architecture, rows: Float[Array, "B T A"], base: Float[Array, "B A"], position: Int[Array, ""] | int
 ) -> Float[Array, "B T A"]:
@@ -392,7 +431,7 @@ def window_actions(
     The first frame of a clip has no action, and the sums of ``model.departures.integrate_actions`` start there.
 
     Args:
-        base: those that lead into the window's first frame.
+        base: those that lead into the window's first frame, or :func:`sums_before` it.
     """
     if arch.departures.integrate_actions:
         is_sum = jnp.arange(rows.shape[-1]) >= rows.shape[-1] // 2
@@ -414,6 +453,7 @@ def rollout(
     cached: bool = True,
     index: Int[Array, " B"] | None = None,
     no_depth: Bool[Array, " B"] | None = None,
+    resting: Float[Array, " A"] | None = None,
 ) -> Decoded:
     """Generates the frames after the prompt.
 
@@ -428,6 +468,7 @@ def rollout(
         index: each clip's number, which decides its draws together with ``key``; 0, 1, … by default.
         no_depth: True for clips without depth; None: all have depth. Such clips' depth is masked in every frame, as in
             training, and zeros in the result.
+        resting: as :func:`resting_actions` returns them.
 
     Returns:
         Tokens of all T frames by branch; the first P are the prompt. If ``sample.shows_means``, the prompt's codes and
@@ -448,7 +489,7 @@ def rollout(
     program = _rollout if cached else _recomputed
     keys = _clip_keys(key, index, clips)
     rows = _padded(arch, actions, frames)
-    made = program(arch, replace(sample, seed=0), params, tokens, no_depth, rows, jnp.asarray(frames), keys)
+    made = program(arch, replace(sample, seed=0), params, tokens, no_depth, rows, jnp.asarray(frames), keys, resting)
     return {branch: grid[:, :frames] for branch, grid in made.items()}
 
 
@@ -459,13 +500,14 @@ def encode_prompt(
     prompt: Tokens,
     actions: Float[Array, "B P A"],
     no_depth: Bool[Array, " B"] | None = None,
+    resting: Float[Array, " A"] | None = None,
 ) -> Prompt:
     """Encodes a prompt for :func:`rollout_from`.
 
     Args:
         prompt: tokens by branch, as for :func:`rollout`.
         actions: those that led into the prompt's frames, normalised.
-        no_depth: as for :func:`rollout`.
+        no_depth, resting: as for :func:`rollout`.
 
     Raises:
         ConfigError: the model does not support these settings.
@@ -473,7 +515,7 @@ def encode_prompt(
     """
     arch.check_sampling(sample)
     tokens, no_depth = _prompt_tokens(arch, prompt, no_depth)
-    state = _start(arch, replace(sample, seed=0), params, tokens, actions, None, no_depth)
+    state = _start(arch, replace(sample, seed=0), params, tokens, actions, None, no_depth, resting)
     return Prompt(tokens, state, _cache_settings(arch, sample))
 
 
@@ -573,9 +615,10 @@ def _rollout(
     actions: Float[Array, "B T A"],
     frames: Int[Array, ""],
     keys: Key[Array, " B"],
+    resting: Float[Array, " A"] | None,
 ) -> Decoded:
     past = tokens["rgb"].shape[1]
-    state = start(arch, sample, params, tokens, actions[:, :past], keys, no_depth)
+    state = start(arch, sample, params, tokens, actions[:, :past], keys, no_depth, resting)
     return with_few_launches(arch, partial(_repeat_step, sample, params, tokens, state, actions[:, past:], frames))
 
 
@@ -612,6 +655,7 @@ def _continue(
         key=keys,
         no_depth=None if state.no_depth is None else repeated(state.no_depth),
         readings=None if state.readings is None else repeated(state.readings),
+        resting=None if state.resting is None else repeated(state.resting),
     )
     return with_few_launches(arch, partial(_repeat_step, sample, params, tokens, state, actions, frames))
 
@@ -656,6 +700,7 @@ def _recomputed(
     actions: Float[Array, "B T A"],
     frames: Int[Array, ""],
     keys: Key[Array, " B"],
+    resting: Float[Array, " A"] | None,
 ) -> Decoded:
     """Eq. 1 without a cache: every pass covers the whole window. The reference for :func:`step`."""
     past = prompt["rgb"].shape[1]
@@ -669,14 +714,14 @@ def _recomputed(
     means = mean_codes.codes_of(sample, tokens, arch.code_bits)
     made: dict[str, Array] = {}
     if arch.state_heads:
-        after_prompt = start(arch, sample, params, prompt, actions[:, :past], keys, no_depth)
+        after_prompt = start(arch, sample, params, prompt, actions[:, :past], keys, no_depth, resting)
         made = _prompt_readings(after_prompt, past, total - past + length)
 
     def next_frame(t: Array, carry: tuple[dict[str, Array], ...]) -> tuple[dict[str, Array], ...]:
         tokens, means, made = carry
         base = window_start(arch, sample, t)
         rows = jax.lax.dynamic_slice_in_dim(actions, base, length, axis=1)
-        rows = window_actions(arch, rows, rows[:, 0], 0)
+        rows = window_actions(arch, rows, sums_before(rows[:, 0], base, resting), 0)
         step_keys = jax.vmap(lambda key: jax.random.split(jax.random.fold_in(key, t), sample.steps))(keys)
         undecided = {branch: cells[:, 0] for branch, cells in tokens.items()}
         masked = jnp.ones(undecided["rgb"].shape, bool)

@@ -21,7 +21,7 @@ from rsjax.models.base import TeacherForced
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.departures.read_previous import frame_before
 from rsjax.models.roboscape.maskgit import sample_tokens
-from rsjax.models.roboscape.sample import cache_slots, read_state, window_actions, window_start
+from rsjax.models.roboscape.sample import cache_slots, read_state, sums_before, window_actions, window_start
 from rsjax.models.roboscape.transformer import empty_cache, run_transformer, run_with_trunk
 from rsjax.tokenizers import lfq
 from rsjax.trainable import Params
@@ -38,6 +38,7 @@ def score_tokens(
     actions: Float[Array, "B T A"],
     no_depth: Bool[np.ndarray, " B"],
     past: int,
+    resting: Float[Array, " A"] | None = None,
 ) -> TeacherForced:
     """Predicts each frame after the prompt from all true frames before it.
 
@@ -47,6 +48,7 @@ def score_tokens(
         actions: normalised; row t led into frame t.
         no_depth: True for clips without depth.
         past: prompt frames, which are not scored.
+        resting: as :func:`rsjax.models.roboscape.sample.resting_actions` returns them.
     """
     frames = actions.shape[1]
     size = frames if arch.departures.rotary else arch.frames
@@ -55,7 +57,7 @@ def score_tokens(
     for base in dict.fromkeys(starts[past:]):
         window = {name: _window(grid, base, size) for name, grid in tokens.items()}
         rows = _window(actions, base, size)
-        rows = window_actions(arch, rows, rows[:, 0], 0)
+        rows = window_actions(arch, rows, sums_before(rows[:, 0], base, resting), 0)
         scores = _score_window(replace(arch, unroll=1), params, window, rows, no_depth)
         scored = [t - base for t in range(past, frames) if starts[t] == base]
         parts.append(jax.tree.map(lambda x, scored=scored: np.asarray(x)[:, scored], scores))

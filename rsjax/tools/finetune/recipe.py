@@ -200,7 +200,7 @@ def finetuned(
         departures=departures,
         state_heads=None,
         backwards=backwards,
-        sample=replace(model.sample, keep_still=kept),
+        sample=replace(model.sample, keep_still=kept, sums="window"),  # recordings begin anywhere
     )
     own = config.tokenizer_train
     patience = settings.patience

@@ -26,7 +26,7 @@ FRAMES = 15
         (GUIDED, SampleConfig(steps=2, unmask="greedy", guidance=2.0)),
         (SUMS, SampleConfig(steps=2, mean_codes=True, read_means=True)),
         (depart(SUMS, whole_frames=True), SampleConfig(steps=1, mean_codes=True, read_means=True, window_stride=2)),
-        (depart(SUMS, whole_frames=True), SampleConfig(steps=1, temperature=1.0, window_stride=5)),
+        (depart(SUMS, whole_frames=True), SampleConfig(steps=1, temperature=1.0, window_stride=5, sums="clip")),
         (depart(GUIDED, whole_frames=True), SampleConfig(steps=1, guidance=2.0)),
     ],
     ids=[
@@ -34,7 +34,7 @@ FRAMES = 15
         "rotary-guided",
         "read-means",
         "whole-frames",
-        "whole-frames-one-kept",
+        "whole-frames-one-kept-sums-of-the-clip",
         "whole-frames-rotary-guided",
     ],
 )
@@ -42,14 +42,17 @@ def test_stepping_recomputes_a_rollout_though_clips_begin_at_different_times(
     model: Architecture, sample: SampleConfig
 ) -> None:
     params, (tokens, actions) = random_params(model), given(model, 1, FRAMES)
-    expected = rollout(model, sample, params, tokens, actions, KEY, cached=False)
+    resting = None
+    if sample.sums == "clip":
+        resting = jnp.linspace(-0.5, 0.5, model.action_inputs)
+    expected = rollout(model, sample, params, tokens, actions, KEY, cached=False, resting=resting)
     late = 4
     cells = {name: jnp.asarray(grid.reshape(BATCH, 1, 1, -1)) for name, grid in tokens.items()}
     keys = jax.vmap(partial(jax.random.fold_in, KEY))(jnp.arange(BATCH))[:, None]
     no_actions = jnp.zeros((1, 1, model.action_inputs))
 
     def begin(cells: dict[str, jax.Array], key: jax.Array) -> State:
-        return start(model, sample, params, cells, no_actions, key, None)
+        return start(model, sample, params, cells, no_actions, key, None, resting)
 
     begin_each = jax.vmap(begin, out_axes=CLIPS)
     next_frame = jax.jit(partial(step, model, sample))

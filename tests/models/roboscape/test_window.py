@@ -13,7 +13,7 @@ from rsjax.config import SampleConfig
 from rsjax.data.normalization import Normalization
 from rsjax.models.roboscape import sample as module
 from rsjax.models.roboscape.architecture import Architecture
-from rsjax.models.roboscape.sample import rollout, window_actions, window_start
+from rsjax.models.roboscape.sample import resting_actions, rollout, sums_before, window_actions, window_start
 from tests.models.roboscape.toy import depart
 from tests.models.roboscape.toy_sample import BATCH, DUAL, KEY, NO_PARAMS, RGB, count_model, given, random_params
 
@@ -45,6 +45,22 @@ def test_a_windows_actions_are_those_of_a_clip_that_begins_there(base: int, inte
     np.testing.assert_allclose(seen, expected, atol=1e-5)
     later = window_actions(model, whole[:, base + 2 : base + 4], whole[:, base], 2)
     np.testing.assert_allclose(later, expected[:, 2:], atol=1e-5)
+
+
+def test_sums_that_go_on_say_where_a_clip_that_moved_as_far_within_the_window_would_be() -> None:
+    raw = np.random.default_rng(0).normal(size=(BATCH, 7, 2)).astype(np.float32)
+    units = Normalization((0.1, -0.2), (0.5, 2.0), (0.0, 1.0))
+    whole = units.action_inputs(raw, integrate=True)
+    base = 3
+    resting = resting_actions(SUMS, SampleConfig(sums="clip"), units)
+    assert resting_actions(SUMS, SampleConfig(), units) is None
+    assert resting_actions(RGB, SampleConfig(sums="clip"), units) is None
+    before = sums_before(whole[:, base], base, resting)
+    seen = window_actions(SUMS, whole[:, base:], before, 0)
+    short = raw[:, base:].copy()
+    short[:, 1] += raw[:, 1 : base + 1].sum(1)
+    np.testing.assert_allclose(seen[..., 2:], units.action_inputs(short, integrate=True)[..., 2:], atol=1e-5)
+    np.testing.assert_allclose(seen[:, 1:, :2], whole[:, base + 1 :, :2], atol=1e-6)
 
 
 @pytest.mark.parametrize(
