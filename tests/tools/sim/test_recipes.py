@@ -150,3 +150,12 @@ def test_a_mix_has_the_test_clips_of_the_expert_and_held_out_contacts(sim: LiftS
     assert contacts.manifest["depth_range"] == store.manifest["depth_range"]
     assert [contacts.source(split)[0]["provenance"]["expert"]["mode"] for split in contacts.splits] == list(RECIPES)
     assert not contact_splits(replace(config, env="metaworld", camera="near", recipe=(EXPERT,)))
+
+
+def test_a_group_of_heights_closes_low_and_high_near_the_cube_and_beside_it() -> None:
+    plans = [scripted(CONFIG, "heights", place, f"{place}") for place in range(4)]
+    manners = [asdict(plan.manner) for plan in plans]  # type: ignore[call-overload]
+    offsets = np.array([manner.pop("offset") for manner in manners])
+    assert all(manner == manners[0] for manner in manners) and len({plan.episode for plan in plans}) == 1
+    assert (np.hypot(*offsets[:, :2].T) < 0.0135).tolist() == [True, True, False, False]
+    assert (offsets[:, 2] > 0.005).tolist() == [False, True, False, True]
