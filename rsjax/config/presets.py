@@ -90,6 +90,8 @@ def tiny_policies() -> Config:
             # It has learned to read its own frames.
             departures=replace(model.departures, self_conditioning_after=0),
             state_heads=StateHeadsConfig(),
+            # Its clips begin anywhere.
+            sample=replace(model.sample, sums="window"),
         ),
         train=replace(
             small.train, start_from="tiny", steps=2500, optimizer=replace(small.train.optimizer, learning_rate=3e-3)
