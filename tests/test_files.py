@@ -35,7 +35,7 @@ from rsjax.tokenizers.lpips import load_lpips
 from rsjax.tools.convert.files import read_tensors
 from rsjax.tools.ingest.annotators.network import require_weights
 from rsjax.tools.ingest.doctor import select
-from rsjax.tools.pipeline.videos import Request, _foreign_actions
+from rsjax.tools.pipeline.videos import VideoRequest, _foreign_actions
 from rsjax.tools.policies.judges.people_and_vlms import HumanJudge
 from rsjax.training.log import read_rows
 from tests.tools.ingest.toy import Source
@@ -97,7 +97,7 @@ def test_a_pipe_is_refused_at_once_in_place_of_a_file(tmp_path: Path) -> None:
     path = tmp_path / "manifest.json"
     os.mkfifo(path)
     assert placeholder(path) == ""
-    request: Any = Request("test", (), None, path, None, {})
+    request: Any = VideoRequest("test", (), None, path, None, {})
     reads: tuple[Callable[[], object], ...] = (
         lambda: read_json(path),
         lambda: open_store(tmp_path),

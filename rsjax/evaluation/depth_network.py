@@ -33,7 +33,7 @@ OFFSET_CLIPS = 50  # clips whose mean depth training starts from
 PER_CALL = 16  # frames that are estimated at once
 
 
-class Network(nn.Module):
+class DepthUNet(nn.Module):
     """A U-Net from frames to the logarithm of depth in metres.
 
     Attributes:
@@ -89,7 +89,7 @@ class DepthNetwork:
 
 def initial(size: int, first: float = 0.0) -> Params:
     """Returns the parameters before training, for square frames of ``size`` pixels per side."""
-    return dict(Network(first).init(jax.random.key(0), jnp.zeros((1, size, size, 3))))
+    return dict(DepthUNet(first).init(jax.random.key(0), jnp.zeros((1, size, size, 3))))
 
 
 def train_depth_network(clips: Sequence[Record], steps: int) -> DepthNetwork:
@@ -141,4 +141,4 @@ def varied(rng: np.random.Generator, frames: UInt8[np.ndarray, "B H W 3"]) -> Fl
 @jax.jit
 def log_depth(params: Params, frames: Array) -> Float[Array, "B H W"]:
     """Returns the logarithm of the depth of each pixel."""
-    return cast(Array, Network().apply(params, frames))
+    return cast(Array, DepthUNet().apply(params, frames))

@@ -176,7 +176,7 @@ def evaluate(
     if coverage is not None and predicted_tokens is not None and predicted_tokens.features is not None:
         distances = coverage.distances(predicted_tokens.features, clips.actions[:, protocol.prompt_frames :])
         familiarity = Familiarity(*coverage.of_clips(distances.mean(1)))
-    repetitions: list[Scored] = []
+    repetitions: list[ClipScores] = []
     curves: list[Curves] = []
     for run in range(protocol.repetitions):
         scenes = make_scenes(
@@ -374,7 +374,7 @@ def scaled(video: Video, side: int) -> Video:
 
 
 @dataclass(frozen=True)
-class Scored:
+class ClipScores:
     """The clips' scores, and the reasons for missing scores.
 
     Attributes:
@@ -397,7 +397,7 @@ class Scored:
         return {name: each for name, each in scores.items() if each.ndim}
 
 
-def score_all(scenes: Mapping[str, Scene], protocol: Protocol, takes_actions: bool = True) -> Scored:
+def score_all(scenes: Mapping[str, Scene], protocol: Protocol, takes_actions: bool = True) -> ClipScores:
     """Scores the prediction and both baselines with all registered metrics.
 
     Args:
@@ -412,7 +412,7 @@ def score_all(scenes: Mapping[str, Scene], protocol: Protocol, takes_actions: bo
             values[metric.name] = _score(metric, scenes, protocol)
         except Unavailable as reason:
             reasons[metric.name] = str(reason)
-    return Scored(values, reasons, {})
+    return ClipScores(values, reasons, {})
 
 
 def _score(metric: Metric, scenes: Mapping[str, Scene], protocol: Protocol) -> dict[str, PerClip]:
@@ -452,7 +452,9 @@ def sample_scores(truth: Video, video: Video, protocol: Protocol, settings: Eval
     return scores
 
 
-def with_best(scored: Scored, scene: Scene, samples: Sequence[Mapping[str, PerClip]], protocol: Protocol) -> Scored:
+def with_best(
+    scored: ClipScores, scene: Scene, samples: Sequence[Mapping[str, PerClip]], protocol: Protocol
+) -> ClipScores:
     """Adds the best score over all samples for each pixel metric; adds nothing if there is only one sample.
 
     ``NAME_best100_incl_ctx`` takes each clip's best sample separately for each metric, over all frames, as iVideoGPT
@@ -471,10 +473,10 @@ def with_best(scored: Scored, scene: Scene, samples: Sequence[Mapping[str, PerCl
         everything = np.stack([values, *(sample[name] for sample in samples)])
         best[f"{name}_best{len(everything)}_incl_ctx"] = reduce(everything, axis=0)
         best[f"{name}_n1_pred_only"] = scored.values[name][name]
-    return Scored(scored.values, scored.reasons, best)
+    return ClipScores(scored.values, scored.reasons, best)
 
 
-def mean_scores(repetitions: Sequence[Scored]) -> Scored:
+def mean_scores(repetitions: Sequence[ClipScores]) -> ClipScores:
     """Returns each clip's mean scores over repetitions with different random draws."""
     if len(repetitions) == 1:
         return repetitions[0]
@@ -483,10 +485,10 @@ def mean_scores(repetitions: Sequence[Scored]) -> Scored:
         return {name: np.mean([each[name] for each in maps], axis=0) for name in maps[0]}
 
     values = {name: mean([each.values[name] for each in repetitions]) for name in repetitions[0].values}
-    return Scored(values, repetitions[0].reasons, mean([each.best for each in repetitions]))
+    return ClipScores(values, repetitions[0].reasons, mean([each.best for each in repetitions]))
 
 
-def summarised(scored: Scored, interval: bool = True) -> dict[str, float]:
+def summarised(scored: ClipScores, interval: bool = True) -> dict[str, float]:
     """Returns each score's mean or median over clips by name, and its interval as ``NAME_low`` and ``NAME_high``."""
     flat: dict[str, float] = {}
     for metric in (metrics()[name] for name in scored.values):

@@ -27,7 +27,7 @@ SAMPLE = "sample"  # the kind of further samples under the own actions, of which
 
 
 @dataclass(frozen=True)
-class Batch:
+class ClipBatch:
     """Some clips under one draw of actions.
 
     Attributes:
@@ -77,7 +77,7 @@ class Generation:
         """Generates the batches that do not exist yet; with ``count`` processes, only the share of number ``index``."""
         rows = [(kind, draw) for kind, actions in self.draws.items() for draw in range(len(actions))]
         rows += [(SAMPLE, sample) for sample in range(1, self.protocol.samples)]
-        batches: list[Batch] = []
+        batches: list[ClipBatch] = []
         for run in range(self.protocol.repetitions):
             for kind, draw in rows:
                 batches += self._row(run, kind, draw)
@@ -107,27 +107,27 @@ class Generation:
             out.append({name: np.concatenate([record[name] for record in records]) for name in records[0]})
         return out
 
-    def _row(self, run: int, kind: str, draw: int) -> Iterator[Batch]:
+    def _row(self, run: int, kind: str, draw: int) -> Iterator[ClipBatch]:
         count = len(self.clips.rgb)
         size = batch_size(self.trained, count)
-        yield from (Batch(run, kind, draw, start, min(size, count - start)) for start in range(0, count, size))
+        yield from (ClipBatch(run, kind, draw, start, min(size, count - start)) for start in range(0, count, size))
 
     @cached_property
     def _truth(self) -> Video:
         return self.clips.video
 
     @cached_property
-    def _memory(self) -> dict[Batch, Record]:
+    def _memory(self) -> dict[ClipBatch, Record]:
         return {}
 
-    def _record(self, batch: Batch) -> Record:
+    def _record(self, batch: ClipBatch) -> Record:
         record = self._read(batch)
         if record is None:  # the file was damaged or deleted in the meantime
             record = self._generate(batch)
             self._keep(batch, record)
         return record
 
-    def _read(self, batch: Batch) -> Record | None:
+    def _read(self, batch: ClipBatch) -> Record | None:
         if self.folder is None:
             return self._memory.get(batch)
         try:
@@ -135,13 +135,13 @@ class Generation:
         except (OSError, ValueError):
             return None
 
-    def _keep(self, batch: Batch, record: Record) -> None:
+    def _keep(self, batch: ClipBatch, record: Record) -> None:
         if self.folder is None:
             self._memory[batch] = record
         else:
             write_file(self.folder / batch.name, encode(record))
 
-    def _generate(self, batch: Batch) -> Record:
+    def _generate(self, batch: ClipBatch) -> Record:
         """Generates a batch; the last batch is padded to the others' size, so that only one program is compiled."""
         sampled = batch.kind == SAMPLE
         rows = np.arange(batch.start, batch.start + batch.clips)

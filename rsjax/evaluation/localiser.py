@@ -46,7 +46,7 @@ def recorded_places(clips: Sequence[Record]) -> tuple[Places, Float[np.ndarray, 
     return Places(np.clip(xy, 0, 1), lifted), np.array([each[f"{cube}_width"] for each in objects])
 
 
-class Network(nn.Module):
+class LocaliserNetwork(nn.Module):
     """A U-Net; an object's place is the mean under a softmax over cells, where each cell adds a learned correction."""
 
     @nn.compact
@@ -121,7 +121,7 @@ def train_localiser(clips: Sequence[Record], steps: int) -> Localiser:
     xy = recorded[0].xy.reshape(-1, 2, 2)
     lifted = recorded[0].lifted.reshape(-1)
 
-    params = Network().init(jax.random.key(0), frames[:1])
+    params = LocaliserNetwork().init(jax.random.key(0), frames[:1])
     optimizer = optax.adam(optax.cosine_decay_schedule(3e-3, steps))
     state = optimizer.init(params)
     rng = np.random.default_rng(0)
@@ -164,4 +164,4 @@ def varied(
 
 @jax.jit
 def _apply(params: Any, frames: Array) -> tuple[Array, Array, Array]:
-    return cast(tuple[Array, Array, Array], Network().apply(params, frames))
+    return cast(tuple[Array, Array, Array], LocaliserNetwork().apply(params, frames))

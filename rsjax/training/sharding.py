@@ -229,7 +229,7 @@ class Sharding:
 
     def _shardings(self, tree: PyTree) -> PyTree:
         if self.kind == "mesh":
-            rows = table(tree, self.mesh.shape[FSDP])
+            rows = partitioned_arrays(tree, self.mesh.shape[FSDP])
             parts = self.mesh.shape[FSDP]
             large = any(np.prod(row.shape) >= SMALL for row in rows)
             require(
@@ -304,7 +304,7 @@ RULES = (
 
 
 @dataclass(frozen=True)
-class Row:
+class PartitionedArray:
     """One array of a state with its partition."""
 
     path: str
@@ -328,13 +328,13 @@ def spec_of(path: str, shape: tuple[int, ...], parts: int) -> P:
     return P()
 
 
-def table(tree: PyTree, parts: int) -> list[Row]:
+def partitioned_arrays(tree: PyTree, parts: int) -> list[PartitionedArray]:
     """Returns every array of a tree of arrays or shapes, with its partition into ``parts``."""
     paths = ((_path(keys), leaf) for keys, leaf in jax.tree.leaves_with_path(tree))
-    return [Row(path, leaf.shape, spec_of(path, leaf.shape, parts)) for path, leaf in paths]
+    return [PartitionedArray(path, leaf.shape, spec_of(path, leaf.shape, parts)) for path, leaf in paths]
 
 
-def shown(rows: list[Row]) -> str:
+def shown(rows: list[PartitionedArray]) -> str:
     """Formats the table: path, shape with the split axis in brackets, and the share of all elements that is split."""
     lines = []
     for row in rows:
@@ -345,7 +345,7 @@ def shown(rows: list[Row]) -> str:
     return "\n".join([*lines, f"{total:,} elements, {cut_elements(rows) / total:.1%} of them cut"])
 
 
-def cut_elements(rows: list[Row]) -> int:
+def cut_elements(rows: list[PartitionedArray]) -> int:
     """Returns the number of elements in arrays that are split."""
     return sum(prod(row.shape) for row in rows if row.spec != P())
 

@@ -12,7 +12,7 @@ from rsjax.data.store import Store, StoreError
 from rsjax.errors import UserError
 from rsjax.evaluation import evaluate as evaluation
 from rsjax.evaluation.evaluate import EvaluationClips, evaluate
-from rsjax.evaluation.generation import Batch, Generation, rolled_out
+from rsjax.evaluation.generation import ClipBatch, Generation, rolled_out
 from rsjax.evaluation.metrics.delta_psnr import other_clips
 from rsjax.evaluation.metrics.psnr import psnr as pixels
 from rsjax.evaluation.protocols import PAPER, find, of_run
@@ -173,7 +173,7 @@ def test_batches_on_disk_are_not_generated_again_and_damaged_ones_are(
     files[4].write_bytes(files[4].read_bytes()[:-1])
     made, generate = [], Generation._generate
 
-    def counted(self: Generation, batch: Batch) -> Record:
+    def counted(self: Generation, batch: ClipBatch) -> Record:
         made.append(batch)
         return generate(self, batch)
 
@@ -200,7 +200,7 @@ def test_batches_for_other_devices_are_made_anew(
     protocol = replace(of_run(trained.config), action_draws=0)
     eval_clips, made = EvaluationClips.read(clips, "test", protocol, trained.config.clips), []
 
-    def true_frames(self: Generation, batch: Batch) -> Record:
+    def true_frames(self: Generation, batch: ClipBatch) -> Record:
         made.append((batch.start, batch.clips))
         return {"rgb": self.clips.rgb[batch.start : batch.start + batch.clips], "depth": None}
 

@@ -21,13 +21,13 @@ from rsjax.tools.pipeline import stages
 from rsjax.tools.pipeline.replay import replay
 from rsjax.tools.pipeline.run import Run
 from rsjax.tools.pipeline.run_clips import on_store
-from rsjax.tools.pipeline.videos import Request, write_videos
+from rsjax.tools.pipeline.videos import VideoRequest, write_videos
 from rsjax.tools.studies.ablation.grid import expand, parse_axes
 from rsjax.trainable import StepContext
 from rsjax.training import loop as loop_module
 from rsjax.training.checkpoint import load_weights
 from rsjax.training.log import SkippedSteps, read_log
-from rsjax.training.sharding import cut_elements, table
+from rsjax.training.sharding import cut_elements, partitioned_arrays
 from rsjax.training.state import create_state
 from rsjax.training.step import combine
 from tests.models import families
@@ -92,7 +92,7 @@ def test_a_loaded_model_generates_plans_and_goes_on_beyond_its_clips(run: Run, t
     many = model.plan(clip["rgb"][:1], np.stack([clip["actions"], -clip["actions"]]))
     np.testing.assert_allclose(many.rgb[0].astype(int), video.rgb, atol=1)  # batches of two sizes round differently
     setting = SETTING[run.config.model.family]
-    request = Request("test", (0,), None, None, len(clip["rgb"]) + 2, {setting: 4})
+    request = VideoRequest("test", (0,), None, None, len(clip["rgb"]) + 2, {setting: 4})
     (written,) = write_videos(run.directory, tmp_path, request, tmp_path / "videos", "gif", 4.0, 1)
     assert written.stat().st_size > 0
     with pytest.raises(UserError, match="no setting nothing"):
@@ -221,7 +221,7 @@ def test_an_autoencoder_without_discriminator_takes_no_adversarial_terms(family:
 def test_a_public_size_is_cut_over_devices_and_described(family: str) -> None:
     config = presets.get(PUBLIC[family])
     state = jax.eval_shape(lambda: create_state(create_model(config), LoopConfig(ema=0.9)))
-    rows = table(state, 2)
+    rows = partitioned_arrays(state, 2)
     assert cut_elements(rows) / sum(int(np.prod(row.shape)) for row in rows) > 0.99
     tiny = describe(with_values(families.FAMILIES[family](), {"model.blocks": 8})).figures
     assert tiny["flops_train_per_clip"] > 0 and tiny["params_world_model"] > 0

@@ -16,7 +16,7 @@ from rsjax.evaluation.registry import Scene, metric
 from rsjax.tools.pipeline.run import Run
 from rsjax.tools.pipeline.run_clips import on_store
 from rsjax.tools.pipeline.stages import run_all
-from rsjax.tools.pipeline.videos import Request, write_videos
+from rsjax.tools.pipeline.videos import VideoRequest, write_videos
 from rsjax.tools.studies.ablation import sweep
 from rsjax.tools.studies.ablation.grid import Choice, expand, parse_axes
 from tests.models.toy_family import ToyConfig
@@ -81,7 +81,7 @@ def test_a_toy_family_trains_generates_and_is_evaluated(config: Config, tmp_path
     assert video.rgb.shape == clip["rgb"].shape
     many = model.plan(clip["rgb"][:1], np.stack([clip["actions"], -clip["actions"]]))
     np.testing.assert_array_equal(many.rgb[0], video.rgb)
-    request = Request("test", (0,), None, None, None, {})
+    request = VideoRequest("test", (0,), None, None, None, {})
     (written,) = write_videos(run.directory, tmp_path, request, tmp_path / "videos", "gif", 4.0, 1)
     assert written.stat().st_size > 0
 

@@ -14,7 +14,7 @@ from rsjax.errors import UserError
 from rsjax.tools.commands.detect import main
 from rsjax.tools.detector.judging import judged
 from rsjax.tools.detector.spectra import FEATURES, RINGS, SHIPPED, Detector, load_detector, video_features
-from rsjax.tools.detector.training import AS_IT_IS, LEARNED, TREATMENTS, Footage, measure, scores, tables, train
+from rsjax.tools.detector.training import AS_IT_IS, LEARNED, TREATMENTS, RunFeatures, measure, scores, tables, train
 from rsjax.tools.logistic_regression import fit
 from rsjax.tools.studies.report.video import write_mp4
 
@@ -103,11 +103,11 @@ def test_videos_and_stores_are_judged_by_pictures_and_marks(detector: Detector, 
         list(judged(detector, tmp_path / "store", "none"))
 
 
-def toy_footage(name: str, family: str, clips: str) -> Footage:
+def toy_footage(name: str, family: str, clips: str) -> RunFeatures:
     values = {kind: {way: rng.normal(size=(6, FEATURES)) for way in TREATMENTS} for kind in ("real", "generated")}
     for way in TREATMENTS:
         values["generated"][way] = values["generated"][way] + 2
-    return Footage(name, family, clips, **values)
+    return RunFeatures(name, family, clips, **values)
 
 
 def test_each_run_is_tested_with_its_clips_left_out() -> None:

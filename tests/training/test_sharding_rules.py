@@ -14,18 +14,27 @@ from rsjax.config import AdamW, ConfigError, LoopConfig, Muon, presets
 from rsjax.models.roboscape.model import RoboScape
 from rsjax.tokenizers.training import TokenizerTraining
 from rsjax.trainable import Trainable
-from rsjax.training.sharding import FSDP, SMALL, Row, Sharding, cut_elements, shown, spec_of, table
+from rsjax.training.sharding import (
+    FSDP,
+    SMALL,
+    PartitionedArray,
+    Sharding,
+    cut_elements,
+    partitioned_arrays,
+    shown,
+    spec_of,
+)
 from rsjax.training.state import create_state
 
 
-def rows(model: Trainable[Any], loop: LoopConfig, parts: int) -> dict[str, Row]:
+def rows(model: Trainable[Any], loop: LoopConfig, parts: int) -> dict[str, PartitionedArray]:
     shapes = jax.eval_shape(partial(create_state, model, loop))
-    found = table(shapes, parts)
+    found = partitioned_arrays(shapes, parts)
     print(shown(found))
     return {row.path: row for row in found}
 
 
-def world_model(preset: str, kind: Any = "adamw", parts: int = 8) -> dict[str, Row]:
+def world_model(preset: str, kind: Any = "adamw", parts: int = 8) -> dict[str, PartitionedArray]:
     config = presets.get(preset)
     loop = replace(config.loop("world_model"), ema=0.99, optimizer={"muon": Muon, "adamw": AdamW}[kind]())
     return rows(RoboScape.create(config), loop, parts)
@@ -98,7 +107,7 @@ def test_what_is_cut_is_large_and_divides(path: str, shape: tuple[int, ...], par
 
 
 def test_the_table_names_what_is_cut() -> None:
-    text = shown(table({"params": {"head": {"kernel": np.zeros((256, 64))}, "bias": np.zeros(64)}}, 8))
+    text = shown(partitioned_arrays({"params": {"head": {"kernel": np.zeros((256, 64))}, "bias": np.zeros(64)}}, 8))
     assert "params/head/kernel" in text
     assert "(256, [64])" in text
     assert text.endswith("16,448 elements, 99.6% of them cut")

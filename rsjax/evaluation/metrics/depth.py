@@ -31,7 +31,7 @@ _MIN_L1_SCALE = 1e-3
 
 
 @dataclass(frozen=True)
-class Protocol:
+class DepthProtocol:
     """Which pixels count, and how they are averaged.
 
     Attributes:
@@ -46,11 +46,11 @@ class Protocol:
     averaging: Literal["frame", "video", "pixel"]
 
 
-PROTOCOLS: dict[Alignment, Protocol] = {
-    "none": Protocol(0.0, np.inf, "video"),
-    "median": Protocol(1e-3, np.inf, "video"),  # WorldArena 2026
-    "affine_disparity": Protocol(1e-3, np.inf, "frame"),  # Video Depth Anything
-    "l1_scale": Protocol(0.0, 70.0, "pixel"),  # Aether, CUT3R
+PROTOCOLS: dict[Alignment, DepthProtocol] = {
+    "none": DepthProtocol(0.0, np.inf, "video"),
+    "median": DepthProtocol(1e-3, np.inf, "video"),  # WorldArena 2026
+    "affine_disparity": DepthProtocol(1e-3, np.inf, "frame"),  # Video Depth Anything
+    "l1_scale": DepthProtocol(0.0, 70.0, "pixel"),  # Aether, CUT3R
 }
 
 

@@ -185,7 +185,7 @@ def facts(config: Config, batch: int) -> dict[str, Any]:
     }
 
 
-def table(numbers: dict[str, Any]) -> Table:
+def terminal_table(numbers: dict[str, Any]) -> Table:
     """Formats numbers for a terminal."""
     out = Table(show_header=False, box=None)
     for name, value in numbers.items():

@@ -39,7 +39,7 @@ def main() -> None:
     import jax
     from rich.console import Console
 
-    from rsjax.tools.bench.run import PARTS, bench, table
+    from rsjax.tools.bench.run import PARTS, bench, terminal_table
 
     jax.config.update("jax_enable_compilation_cache", False)  # so that compilation itself is measured
     rival = None
@@ -55,7 +55,7 @@ def main() -> None:
             write_json(options.json, numbers)
 
     numbers = bench(config, options.batch, parts, options.horizons, rival, say=console.print, keep=keep)
-    console.print(table(numbers))
+    console.print(terminal_table(numbers))
 
 
 def pytorch_rival(config: Config) -> Callable[..., dict[str, Any]]:

@@ -104,14 +104,14 @@ def main() -> None:
     from rsjax.evaluation.results import read_result
     from rsjax.evaluation.verdict import verdict
     from rsjax.model_directory import locate
-    from rsjax.tools.pipeline.evaluations import Request, evaluate_run
+    from rsjax.tools.pipeline.evaluations import EvaluationRequest, evaluate_run
 
     changes = {name: value for name in CHANGES if (value := getattr(options, name)) is not None}
     if options.as_published:
         changes["as_published"] = True
     settings = {name: value for name, value in vars(options.eval).items() if value is not None}
     where = (options.data, options.split, options.store, options.overwrite, options.second_takes)
-    request = Request(options.protocol, changes, settings, *where)
+    request = EvaluationRequest(options.protocol, changes, settings, *where)
     for run in options.runs:
         for folder in evaluate_run(locate(run), options.data_dir, request):
             if distributed.is_lead():

@@ -73,11 +73,11 @@ def main() -> None:
     tune_process()
     options = parse_options(sys.argv[1:], "rsjax generate", Options.__doc__ or "", Options())
     from rsjax.model_directory import locate, output_directory
-    from rsjax.tools.pipeline.videos import Request, write_videos
+    from rsjax.tools.pipeline.videos import VideoRequest, write_videos
 
     decoding = {field.name: getattr(options, field.name) for field in fields(SampleConfig)}
     sample = {name: value for name, value in decoding.items() if value is not None}
-    request = Request(options.split, options.clips, options.actions_from, options.actions, options.frames, sample)
+    request = VideoRequest(options.split, options.clips, options.actions_from, options.actions, options.frames, sample)
     run = locate(options.run)
     out = options.out or output_directory(run, "generated")
     how = (options.format, options.fps, options.scale, options.store)

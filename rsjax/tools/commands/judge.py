@@ -31,7 +31,7 @@ def main() -> None:
     tune_process()
     options = parse_options(sys.argv[1:], "rsjax judge", Options.__doc__ or "", Options())
     from rsjax.tools.policies.judges import head_judge, judge_training
-    from rsjax.tools.policies.judges.validation import table, whole_clips
+    from rsjax.tools.policies.judges.validation import confusion_table, whole_clips
     from rsjax.tools.policies.run_data import with_clips
     from rsjax.tools.studies.tables import as_markdown
 
@@ -41,7 +41,7 @@ def main() -> None:
         make = judge_training.validate_heads
         folder = head_judge.FOLDER
     result = make(with_clips(options.run), options.data_dir, options.store, part(options, JudgeSettings))
-    print(f"judge on {result['clips']} held-out clips: frames by label\n\n{as_markdown(table(result))}\n")
+    print(f"judge on {result['clips']} held-out clips: frames by label\n\n{as_markdown(confusion_table(result))}\n")
     if whole := whole_clips(result):
         print(f"whole clips, by how many frames in a row must show success\n\n{as_markdown(whole)}\n")
     print(options.run / folder)

@@ -57,14 +57,14 @@ _WRAPPERS = {
 UNARY = {"bitcast", "convert", "copy", "reshape", "transpose"}
 
 
-class Work(NamedTuple):
+class ProductCost(NamedTuple):
     """Products of matrices: operations, and the seconds that they take at the peak of their number format."""
 
     flops: float = 0
     seconds: float = 0
 
-    def __add__(self, other: "Work") -> "Work":  # type: ignore[override]
-        return Work(self.flops + other.flops, self.seconds + other.seconds)
+    def __add__(self, other: "ProductCost") -> "ProductCost":  # type: ignore[override]
+        return ProductCost(self.flops + other.flops, self.seconds + other.seconds)
 
 
 @dataclass(frozen=True)
@@ -252,7 +252,7 @@ class _Counter:
         results = sum(map(self._bytes, one.arrays))
         sent = 0.0
         transfer = 0.0
-        work = Work()
+        work = ProductCost()
         collective = next((kind for kind in COLLECTIVES if opcode.startswith(kind)), None)
         if opcode == "fusion":
             inner = self.module[one.called[0]]
@@ -376,9 +376,9 @@ class _Counter:
             return 1
         return min(1.0, inner[update.operands[place]].arrays[0].size / max(1, update.arrays[0].size))
 
-    def _products(self, inner: Computation) -> Work:
+    def _products(self, inner: Computation) -> ProductCost:
         """Returns the work of all products in a fusion."""
-        work = Work()
+        work = ProductCost()
         for one in inner:
             if one.opcode == "fusion":
                 work += self._products(self.module[one.called[0]])
@@ -386,7 +386,7 @@ class _Counter:
                 work += self._product(one, inner)
         return work
 
-    def _product(self, one: Instruction, computation: Computation) -> Work:
+    def _product(self, one: Instruction, computation: Computation) -> ProductCost:
         """Returns the work of a product or convolution; none for other instructions."""
         if one.opcode == "dot":
             left = computation[one.operands[0]].arrays[0]
@@ -395,18 +395,18 @@ class _Counter:
             left = computation[one.operands[0]].arrays[0]
             flops = convolution_flops(one, left, computation[one.operands[1]].arrays[0], one.arrays[0])
         else:
-            return Work()
+            return ProductCost()
         return self._work(flops, left.dtype, one.attribute("operand_precision"))
 
-    def _work(self, flops: float, dtype: str, precision: str = "") -> Work:
+    def _work(self, flops: float, dtype: str, precision: str = "") -> ProductCost:
         peak = self.card.peak
         if dtype == "f32":
             peak = self.card.float32
             if "highest" in precision:
                 peak = self.card.highest
-        return Work(flops, flops / peak)
+        return ProductCost(flops, flops / peak)
 
-    def _call(self, one: Instruction, computation: Computation) -> Work:
+    def _call(self, one: Instruction, computation: Computation) -> ProductCost:
         """Returns the work of a custom call, from the shapes of its operands and results."""
         target = _target(one)
         operands = [computation[name].arrays[0] for name in one.operands]
@@ -427,7 +427,7 @@ class _Counter:
             flops = products * 2 * prod(map(int, scores)) * operands[0].dims[-1]
             return self._work(flops, operands[0].dtype)
         if target in PLAIN_CALLS:
-            return Work()
+            return ProductCost()
         kernels = [name for name in KERNEL_FLOPS if re.search(rf"\b{re.escape(name)}\b", one.op_name)]
         if kernels:
             count = KERNEL_FLOPS[max(kernels, key=len)]
@@ -436,7 +436,7 @@ class _Counter:
             f"{one.name}: the operations of the custom call {target} ({one.op_name}) are not known and not counted; "
             "for a kernel of Pallas, register them in rsjax/layers/kernel_flops.py"
         )
-        return Work()
+        return ProductCost()
 
 
 def _group(one: Instruction) -> list[int]:

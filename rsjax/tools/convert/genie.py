@@ -33,7 +33,7 @@ from rsjax.trainable import Params
 FIXED = {"qkv_bias": False, "proj_bias": True, "mlp_bias": True}
 
 
-def table(config: Architecture) -> tuple[Entry, ...]:
+def name_table(config: Architecture) -> tuple[Entry, ...]:
     """Returns an entry for each public tensor of the network.
 
     Raises:
@@ -192,7 +192,7 @@ def from_public(
     """
     config = infer_config(source, tensors, settings, heads, names)
     shapes = jax.eval_shape(Transformer(config).init_params, jax.random.key(0))
-    return config, to_params(source, tensors, table(config), shapes, names)
+    return config, to_params(source, tensors, name_table(config), shapes, names)
 
 
 def convert(source: Path, out: Path, heads: int | None) -> list[str]:
@@ -216,7 +216,7 @@ def export(source: Path, out: Path) -> list[str]:
     """Exports a directory's world model to a safetensors file. Errors as in :func:`convert`."""
     replaces = check_file(out)
     config, params = load_world_model(source)
-    tensors = to_tensors(params, table(config))
+    tensors = to_tensors(params, name_table(config))
     write_published(out, tensors, settings_of(config))
     text = f"under their public names; settings in {SETTINGS}{replaces}"
     return [f"{out}: {len(tensors)} tensors of a Genie, {text}"]

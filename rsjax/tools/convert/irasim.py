@@ -55,7 +55,7 @@ class Variant(NamedTuple):
 VARIANT = Variant()
 
 
-def table(config: Architecture) -> Table:
+def name_table(config: Architecture) -> Table:
     """Returns an entry for each public tensor of the network except the positions."""
     linear = config.action_activation == "none"
     if linear:
@@ -202,14 +202,14 @@ def from_public(
     config = own or infer_config(source, tensors, variant, names)
     used = {name: x for name, x in tensors.items() if name not in FIXED}
     shapes = jax.eval_shape(DiT(config).init_params, jax.random.key(0))
-    return config, to_params(source, used, table(config), shapes, names), len(tensors) - len(used)
+    return config, to_params(source, used, name_table(config), shapes, names), len(tensors) - len(used)
 
 
 def to_public(config: Architecture, params: Params) -> Tensors:
     """Returns the tensors of a public file, including the fixed positions."""
     space = grid_positions(*config.grid, config.width)
     time = positions(config.frames, config.width)
-    return {"pos_embed": space[None], "temp_embed": time[None]} | to_tensors(params, table(config))
+    return {"pos_embed": space[None], "temp_embed": time[None]} | to_tensors(params, name_table(config))
 
 
 def convert(source: Path, out: Path, weights: Literal["ema", "raw"], variant: Variant = VARIANT) -> list[str]:

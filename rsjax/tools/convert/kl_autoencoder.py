@@ -39,7 +39,7 @@ OLDER = {"query": "to_q", "key": "to_k", "value": "to_v", "proj_attn": "to_out.0
 _OLDER = re.compile(rf"(mid_block\.attentions\.0\.)({'|'.join(OLDER)})\.")
 
 
-def table(config: KLConfig) -> Table:
+def name_table(config: KLConfig) -> Table:
     """Returns an entry for each public tensor.
 
     Raises:
@@ -119,7 +119,7 @@ def from_public(
     if factor != SDXL_FACTOR:
         note(f"{source}: its latents have the factor {factor:g}; the public IRASim needs SDXL's, {SDXL_FACTOR:g}")
     fixed = {"mean": shift, "log_deviation": -math.log(factor)}
-    params = to_params(source, tensors, table(config), _shapes(config), names)
+    params = to_params(source, tensors, name_table(config), _shapes(config), names)
     latents = {name: np.full(config.latent_channels, x, np.float32) for name, x in fixed.items()}
     return config, params | {"latents": latents}
 
@@ -131,7 +131,7 @@ def to_public(config: KLConfig, params: Params) -> tuple[Tensors, dict[str, Any]
         ConvertError: the public format cannot express the network or its latents' statistics.
     """
     networks = {name: params[name] for name in ("encoder", "decoder")}
-    tensors = to_tensors(networks, table(config))
+    tensors = to_tensors(networks, name_table(config))
     mean = np.asarray(params["latents"]["mean"])
     deviation = np.exp(params["latents"]["log_deviation"])
     if np.ptp(mean) > 0 or np.ptp(deviation) > 0:

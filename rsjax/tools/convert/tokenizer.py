@@ -42,7 +42,7 @@ def public_name(key: str, weights: Weights) -> str:
     return f"model_ema.{key.replace('.', '')}"
 
 
-def table(config: TokenizerConfig) -> tuple[Entry, ...]:
+def name_table(config: TokenizerConfig) -> tuple[Entry, ...]:
     """Returns an entry for each public tensor of the network, under its raw name."""
     levels = range(len(config.channel_multipliers))
     widths = [config.channels * multiplier for multiplier in config.channel_multipliers]
@@ -158,7 +158,7 @@ def from_public(
         ConvertError: tensors are missing, unexpected, of the wrong shape, not finite, or not a tokenizer's.
     """
     config = config or infer_config(source, tensors, weights, names)
-    entries = table(config)
+    entries = name_table(config)
     keys = {public_name(entry.key, weights): entry.key for entry in entries}
     kept: Tensors = {}
     aside: Counter[str] = Counter()
@@ -191,6 +191,6 @@ def export(source: Path, out: Path) -> list[str]:
     """Exports a directory's tokenizer to a safetensors file. Errors as in :func:`convert`."""
     replaces = check_file(out)
     config, params = load_tokenizer(source)
-    tensors = to_tensors(params, table(config))
+    tensors = to_tensors(params, name_table(config))
     write_safetensors(out, tensors, {METADATA: json.dumps(to_dict(config))})
     return [f"{out}: {len(tensors)} tensors of a tokenizer, under their public names{replaces}"]

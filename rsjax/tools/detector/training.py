@@ -101,7 +101,7 @@ LEARNED = (AS_IT_IS, "MP4, CRF 18", "MP4, CRF 28", "WebP, quality 80", "1.5 time
 
 
 @dataclass(frozen=True)
-class Footage:
+class RunFeatures:
     """The features of a run's real and generated videos.
 
     Attributes:
@@ -118,7 +118,7 @@ class Footage:
     generated: Mapping[str, Float[np.ndarray, "N F"]]
 
 
-def read_footage(run: Path) -> Footage:
+def read_footage(run: Path) -> RunFeatures:
     """Reads the predicted frames that the run's evaluation kept, and the true ones beside them.
 
     Raises:
@@ -127,7 +127,7 @@ def read_footage(run: Path) -> Footage:
     config = load_config(run)
     kept = read_frames(Run(config, run, Path("data")).output("evaluation").parent)
     first = config.prompt_frames
-    return Footage(
+    return RunFeatures(
         run.name,
         config.model.family,
         clips_name(config),
@@ -148,7 +148,7 @@ def treated_features(videos: UInt8[np.ndarray, "N T H W 3"]) -> dict[str, Float[
     return {name: np.stack([video_features(treat(video)) for video in videos]) for name, treat in TREATMENTS.items()}
 
 
-def train(footage: Sequence[Footage]) -> Detector:
+def train(footage: Sequence[RunFeatures]) -> Detector:
     """Trains a detector on runs' real and generated videos, as they are and re-encoded."""
     real = [each.real[name] for each in footage for name in LEARNED]
     generated = [each.generated[name] for each in footage for name in LEARNED]
@@ -156,7 +156,7 @@ def train(footage: Sequence[Footage]) -> Detector:
     return Detector(fit(np.concatenate(real + generated), labels))
 
 
-def measure(footage: Sequence[Footage]) -> list[dict[str, Any]]:
+def measure(footage: Sequence[RunFeatures]) -> list[dict[str, Any]]:
     """Tests detectors on runs whose clips, and then also whose family of models, are left out of the training.
 
     Returns:
@@ -179,7 +179,7 @@ def measure(footage: Sequence[Footage]) -> list[dict[str, Any]]:
     return rows
 
 
-def tested(detector: Detector, held: Footage, without: str) -> list[dict[str, Any]]:
+def tested(detector: Detector, held: RunFeatures, without: str) -> list[dict[str, Any]]:
     """Returns a row for each treatment: how a detector does on a run."""
     about = {"run": held.name, "family": held.family, "clips": held.clips, "without": without}
     return [

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from rsjax.tools.ingest.actions import ActionConfig, Layout, sampled_actions
+from rsjax.tools.ingest.actions import ActionConfig, ActionLayout, sampled_actions
 from rsjax.tools.ingest.annotate import camera_of
 from rsjax.tools.ingest.annotators.motion import DISFlow
 from rsjax.tools.ingest.episode import Episode, EpisodeError
@@ -98,7 +98,7 @@ def measure_delay(episodes: Sequence[Episode], camera: str, every: int) -> Delay
 
 def delayed(episode: Episode, frames: Int[np.ndarray, " T"], delay: int) -> Float[np.ndarray, "T A"]:
     """Returns the change that was commanded for each of these frames if commands act ``delay`` recorded frames late."""
-    layout = Layout.from_json(episode.meta.get("actions", {}))
+    layout = ActionLayout.from_json(episode.meta.get("actions", {}))
     config = ActionConfig(offset=delay)
     if layout.kind == "absolute":
         config = replace(config, kind="delta")

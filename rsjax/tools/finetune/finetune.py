@@ -10,7 +10,7 @@ from rsjax.progress import Progress, note
 from rsjax.tools.finetune.cost import estimate
 from rsjax.tools.finetune.recipe import FIXED_CAMERA, MARGIN, Finetuning, finetuned, measure_tokenizer, moving_share
 from rsjax.tools.finetune.recordings import Cutting, Recordings, ingest_options
-from rsjax.tools.finetune.start import Source, content_of, write_start
+from rsjax.tools.finetune.start import StartingModel, content_of, write_start
 from rsjax.tools.ingest.ingest import count_steps, ingest, list_episodes
 from rsjax.tools.ingest.options import make_plan, make_runner
 from rsjax.tools.ingest.summary import lines
@@ -23,7 +23,7 @@ START = "start"
 OTHERS = "holds weights of another model, or for other clips or settings; choose another --out"
 
 
-def make_clips(recordings: Recordings, cutting: Cutting, source: Source, out: Path) -> Store:
+def make_clips(recordings: Recordings, cutting: Cutting, source: StartingModel, out: Path) -> Store:
     """Returns the store of clips: the one that was named, or one that is ingested into ``out`` unless it is there.
 
     Raises:
@@ -46,7 +46,7 @@ def make_clips(recordings: Recordings, cutting: Cutting, source: Source, out: Pa
     return open_store(plan.out)
 
 
-def prepare(source: Source, store: Store, settings: Finetuning, out: Path) -> Config:
+def prepare(source: StartingModel, store: Store, settings: Finetuning, out: Path) -> Config:
     """Writes the weights to start from, decides on the tokenizer, and returns the run's configuration.
 
     An interrupted call continues, and a finished one returns the same configuration again.
@@ -102,7 +102,7 @@ def depth_advice(store: Store, config: Config) -> str:
 
 
 def finetune(
-    source: Source,
+    source: StartingModel,
     recordings: Recordings,
     cutting: Cutting,
     settings: Finetuning,

@@ -24,7 +24,7 @@ from rsjax.evaluation.metrics.psnr import psnr
 from rsjax.evaluation.metrics.psnr_motion import moved
 from rsjax.models.base import create_autoencoder
 from rsjax.tools.convert import directory as converted
-from rsjax.tools.finetune.start import Source
+from rsjax.tools.finetune.start import StartingModel
 from rsjax.tools.pipeline.run_clips import on_store
 from rsjax.tools.pipeline.validation import held_out
 
@@ -108,7 +108,7 @@ class Finetuning:
 
 
 @dataclass(frozen=True)
-class Reconstruction:
+class ReconstructionScores:
     """How well a tokenizer reconstructs held-out frames of the recordings, in dB of PSNR.
 
     Attributes:
@@ -129,14 +129,14 @@ class Reconstruction:
         return f"{made}, the first frame repeated has {self.repeat_first:.1f}"
 
 
-def measure_tokenizer(source: Source, store: Store) -> Reconstruction:
+def measure_tokenizer(source: StartingModel, store: Store) -> ReconstructionScores:
     """Measures the tokenizer of a model on held-out clips of the recordings."""
     _, params = converted.load_tokenizer(source.directory)
     codec = create_autoencoder(source.config).codec(params, Normalization.create(store))
     rgb = load_clips(store, MEASURED_CLIPS, held_out(store)).rgb
     made = codec.decode(codec.encode(Video(rgb)), np.zeros(len(rgb), bool)).rgb
     repeated = np.repeat(rgb[:, :1], rgb.shape[1] - 1, axis=1)
-    return Reconstruction(float(np.mean(psnr(rgb, made))), float(np.mean(psnr(rgb[:, 1:], repeated))))
+    return ReconstructionScores(float(np.mean(psnr(rgb, made))), float(np.mean(psnr(rgb[:, 1:], repeated))))
 
 
 def moving_share(store: Store) -> float:
@@ -166,7 +166,7 @@ def of_targets(store: Store) -> bool:
 
 
 def finetuned(
-    source: Source, store: Store, start: str, settings: Finetuning, adapts: bool, still: bool = False
+    source: StartingModel, store: Store, start: str, settings: Finetuning, adapts: bool, still: bool = False
 ) -> Config:
     """Returns the configuration of the run.
 

@@ -11,7 +11,7 @@ from rsjax.data.store import MANIFEST
 from rsjax.errors import UserError
 from rsjax.progress import note
 from rsjax.tools.finetune.delay import measure_delay
-from rsjax.tools.ingest.actions import ActionConfig, Compose, Layout, check_declared
+from rsjax.tools.ingest.actions import ActionConfig, ActionLayout, Compose, check_declared
 from rsjax.tools.ingest.episode import Episode, EpisodeError, EpisodeRef, EpisodeSource
 from rsjax.tools.ingest.formats import FORMATS, open_source
 from rsjax.tools.ingest.options import IngestOptions, source_options
@@ -160,7 +160,7 @@ def readable_episodes(source: EpisodeSource, refs: Sequence[EpisodeRef]) -> tupl
 def says_what_actions_are(episode: Episode) -> bool:
     """Returns whether an episode's data set declares what may be done to its actions besides copying them."""
     try:
-        check_declared(Layout.from_json(episode.meta.get("actions", {})), 1, ActionConfig(offset=1))
+        check_declared(ActionLayout.from_json(episode.meta.get("actions", {})), 1, ActionConfig(offset=1))
     except EpisodeError:
         return False
     return True
@@ -170,7 +170,7 @@ def how_to_compose(episode: Episode, every: int) -> Compose:
     """Returns how the actions of ``every`` recorded frames become one: joined, or stacked if nobody says how."""
     config = ActionConfig()
     try:
-        check_declared(Layout.from_json(episode.meta.get("actions", {})), every, config)
+        check_declared(ActionLayout.from_json(episode.meta.get("actions", {})), every, config)
     except EpisodeError:
         return "stack"
     return config.compose

@@ -26,7 +26,7 @@ GENIE = "genie_35m_actions"  # the preset with the settings that a converted che
 
 
 @dataclass(frozen=True)
-class Source:
+class StartingModel:
     """A trained model to start from.
 
     Attributes:
@@ -44,7 +44,7 @@ class Source:
         return self.architecture.grid * self.config.tokenizer.downsampling
 
 
-def find_source(name: Path | str) -> Source:
+def find_source(name: Path | str) -> StartingModel:
     """Finds a model by its name in the package, or in a run directory, a saved model or a converted checkpoint.
 
     Raises:
@@ -71,24 +71,26 @@ def find_source(name: Path | str) -> Source:
         networks["action_encoder"] = preset.model.action_encoder
         tokenizer = replace(read_tokenizer_config(directory), vocabularies=architecture.vocabularies)
         config = replace(preset, tokenizer=tokenizer, model=replace(preset.model, **networks))
-        return Source(directory, replace(config, eval=replace(config.eval, clips=100, repetitions=1)), architecture)
+        return StartingModel(
+            directory, replace(config, eval=replace(config.eval, clips=100, repetitions=1)), architecture
+        )
     config = load_config(directory)
     if not isinstance(config.model, TokenModelConfig):
         raise UserError(
             f"{directory}: a model of family {config.model.family!r}; rsjax finetune takes roboscape and genie, and "
             f"rsjax train --train.start-from the others"
         )
-    return Source(directory, config, read_architecture(directory))
+    return StartingModel(directory, config, read_architecture(directory))
 
 
-def content_of(source: Source) -> str:
+def content_of(source: StartingModel) -> str:
     """Returns a hash of a model's settings and weights, which stays the same where the model is moved to."""
     _, tokenizer_params = converted.load_tokenizer(source.directory)
     _, params = converted.load_world_model(source.directory)
     return content_key(source.config, fingerprint((tokenizer_params, params)))
 
 
-def write_start(source: Source, folder: Path) -> None:
+def write_start(source: StartingModel, folder: Path) -> None:
     """Writes both networks, the world model's without its action encoder, as ``rsjax convert`` does."""
     tokenizer, tokenizer_params = converted.load_tokenizer(source.directory)
     _, params = converted.load_world_model(source.directory)

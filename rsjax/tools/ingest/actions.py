@@ -2,8 +2,8 @@
 
 An :class:`Episode` has a row of actions for each recorded frame, in its data set's units. A clip keeps about every
 tenth frame; each of its actions combines the rows between two kept frames, in the way that :class:`ActionConfig`
-chooses and :class:`Layout` allows. :func:`layout_of` decides what each dimension is: a step, which adds up over skipped
-frames, or a target.
+chooses and :class:`ActionLayout` allows. :func:`layout_of` decides what each dimension is: a step, which adds up over
+skipped frames, or a target.
 
 Axes: N recorded frames, T sampled frames, K rows between two of these, A recorded and A' resulting action dimensions.
 """
@@ -28,7 +28,7 @@ _FOLLOWS = 0.5  # share of the state's standard deviation within which actions f
 
 
 @dataclass(frozen=True)
-class Layout:
+class ActionLayout:
     """The meaning of an action's numbers; readers store it in ``episode.meta["actions"]``.
 
     Attributes:
@@ -53,7 +53,7 @@ class Layout:
         return {name: value for name, value in values.items() if name != "unclear"}
 
     @classmethod
-    def from_json(cls, values: Mapping[str, Any]) -> "Layout":
+    def from_json(cls, values: Mapping[str, Any]) -> "ActionLayout":
         """Inverts :meth:`to_json`; missing fields get their defaults."""
         dims = (tuple(values.get(name, ())) for name in ("quaternions", "held", "unclear"))
         return cls(values.get("kind", "delta"), *dims)
@@ -82,7 +82,7 @@ class ActionConfig:
                 raise ConfigError(f"actions.{name} is {getattr(self, name)!r}; choose one of {', '.join(allowed)}")
 
 
-def check_layout(layout: Layout, width: int, where: Path | str) -> None:
+def check_layout(layout: ActionLayout, width: int, where: Path | str) -> None:
     """Raises :class:`EpisodeError` if a layout names dimensions that actions of this width do not have.
 
     Args:
@@ -95,7 +95,7 @@ def check_layout(layout: Layout, width: int, where: Path | str) -> None:
             raise EpisodeError.at(where, problem, f"mend the option {name}")
 
 
-def check_declared(layout: Layout, skipped: int, config: ActionConfig) -> None:
+def check_declared(layout: ActionLayout, skipped: int, config: ActionConfig) -> None:
     """Raises :class:`EpisodeError` if it is not declared what must be known to make a clip's actions.
 
     Args:
@@ -135,7 +135,7 @@ def align_actions(rows: Float[np.ndarray, "N A"], after: bool = False) -> Float3
 
 
 def sampled_actions(
-    actions: Float32[np.ndarray, "N A"], frames: Int[np.ndarray, " T"], config: ActionConfig, layout: Layout
+    actions: Float32[np.ndarray, "N A"], frames: Int[np.ndarray, " T"], config: ActionConfig, layout: ActionLayout
 ) -> Float32[np.ndarray, "T A2"]:
     """Returns the action that led to each of these frames from the previous one in ``frames``; row 0 is zeros.
 
@@ -181,7 +181,7 @@ def continuous_signs(quaternions: Float[np.ndarray, "N 4"]) -> Float[np.ndarray,
     return quaternions * signs[: len(quaternions), None].astype(quaternions.dtype)
 
 
-def _shifted(rows: Float64[np.ndarray, "N A"], offset: int, layout: Layout) -> Float64[np.ndarray, "N A"]:
+def _shifted(rows: Float64[np.ndarray, "N A"], offset: int, layout: ActionLayout) -> Float64[np.ndarray, "N A"]:
     """Moves row t - offset to row t. Beyond the ends, absolute and held values repeat and deltas mean no motion."""
     wanted = np.arange(len(rows)) - offset
     nearest = np.clip(wanted, min(1, len(rows) - 1), len(rows) - 1)
@@ -194,7 +194,7 @@ def _shifted(rows: Float64[np.ndarray, "N A"], offset: int, layout: Layout) -> F
     return shifted
 
 
-def _differences(rows: Float64[np.ndarray, "N A"], layout: Layout) -> Float64[np.ndarray, "N A"]:
+def _differences(rows: Float64[np.ndarray, "N A"], layout: ActionLayout) -> Float64[np.ndarray, "N A"]:
     """Turns absolute rows into steps from the previous row; quaternions become q₋₁⁻¹ q, in the hand's own frame."""
     steps = np.diff(rows, axis=0, prepend=rows[:1])
     before = np.concatenate([rows[:1], rows[:-1]])
@@ -207,7 +207,7 @@ def _differences(rows: Float64[np.ndarray, "N A"], layout: Layout) -> Float64[np
 
 
 def _composed(
-    rows: Float64[np.ndarray, "K A"], compose: Compose, layout: Layout, steps: bool
+    rows: Float64[np.ndarray, "K A"], compose: Compose, layout: ActionLayout, steps: bool
 ) -> Float64[np.ndarray, " A2"]:
     """Combines rows into one.
 
@@ -266,12 +266,12 @@ def layout_of(
     quaternions: Sequence[int] = (),
     names: Sequence[str] = (),
     states: Float[np.ndarray, "N S"] | None = None,
-) -> Layout:
+) -> ActionLayout:
     """Builds the layout of an episode's actions from what its data set declares; notes which cannot be steps.
 
     Args:
         actions: aligned as in :class:`rsjax.tools.ingest.episode.Episode`.
-        kind: as in :class:`rsjax.tools.ingest.actions.Layout`; None: not declared.
+        kind: as in :class:`rsjax.tools.ingest.actions.ActionLayout`; None: not declared.
         held: likewise; None: not declared. If it is declared, no dimension is questioned.
         quaternions: likewise.
         names: names of the dimensions.
@@ -288,7 +288,7 @@ def layout_of(
         if states is not None and states.shape == actions.shape:
             like = states[1:]
         unclear = tuple(_no_steps(actions[1:], known, named, like))
-    return Layout(kind or "undeclared", tuple(quaternions), tuple(held or ()), unclear)
+    return ActionLayout(kind or "undeclared", tuple(quaternions), tuple(held or ()), unclear)
 
 
 def _no_steps(
@@ -340,7 +340,7 @@ def flat_names(names: Any, width: int) -> list[str]:
     return [str(name) for name in names]
 
 
-def describe_dimensions(layout: Layout, names: Sequence[str], config: ActionConfig, width: int) -> list[str]:
+def describe_dimensions(layout: ActionLayout, names: Sequence[str], config: ActionConfig, width: int) -> list[str]:
     """Returns a line for each dimension of a clip's actions: its name, and what it is.
 
     Args:

@@ -20,7 +20,7 @@ from rsjax.config import ConfigError, content_key, require, to_dict
 from rsjax.data.normalization import Statistics
 from rsjax.tools.ingest.actions import (
     ActionConfig,
-    Layout,
+    ActionLayout,
     check_declared,
     describe_dimensions,
     flat_names,
@@ -82,7 +82,7 @@ def check_first(source: EpisodeSource, config: ClipConfig) -> None:
             episode = source.read(ref)
             step = check_rate(episode.fps, config.windows)
             try:
-                check_declared(Layout.from_json(episode.meta.get("actions", {})), round(step), config.actions)
+                check_declared(ActionLayout.from_json(episode.meta.get("actions", {})), round(step), config.actions)
             except EpisodeError as error:
                 raise ConfigError(str(error)) from error
 
@@ -125,7 +125,7 @@ def cut(annotated: Annotated, config: ClipConfig) -> Records:
     stacked = 0  # rows that each action stacks
     if config.actions.compose == "stack" and whole:
         stacked = round(step)
-    layout = Layout.from_json(episode.meta.get("actions", {}))
+    layout = ActionLayout.from_json(episode.meta.get("actions", {}))
     names = flat_names(episode.meta.get("action_names"), episode.actions.shape[1])
     pictures = _Fitted(episode.cameras[camera].read, config)
     depths, unit = _depths(annotated, camera, config, pictures)

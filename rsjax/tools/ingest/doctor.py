@@ -23,7 +23,7 @@ from rsjax.data.store import MANIFEST
 from rsjax.errors import did_you_mean
 from rsjax.files import disk_guard, parse_json, regular, write_atomically
 from rsjax.processes import WorkerDied, run_items
-from rsjax.tools.ingest.actions import Layout
+from rsjax.tools.ingest.actions import ActionLayout
 from rsjax.tools.ingest.episode import (
     Depths,
     Episode,
@@ -167,7 +167,7 @@ def _actions(episode: Episode) -> Iterator[Problem]:
     rows = episode.actions[1:]
     if len(rows) and not rows.any():
         yield "action", "all are zero"
-    layout = Layout.from_json(episode.meta.get("actions", {}))
+    layout = ActionLayout.from_json(episode.meta.get("actions", {}))
     for doubt in layout.unclear:
         yield "action", f"{doubt}, so it is no step: declare kind and held"
     for first in layout.quaternions:
@@ -178,7 +178,7 @@ def _actions(episode: Episode) -> Iterator[Problem]:
 
 
 def _flips(episode: Episode) -> Iterator[Problem]:
-    arrays = [("actions", 1, episode.actions[1:], Layout.from_json(episode.meta.get("actions", {})).held)]
+    arrays = [("actions", 1, episode.actions[1:], ActionLayout.from_json(episode.meta.get("actions", {})).held)]
     if episode.states is not None:
         arrays.append(("states", 0, episode.states, ()))
     for name, offset, rows, others in arrays:

@@ -149,7 +149,7 @@ class Episode:
         cameras: pictures by the camera's name.
         depth: depth maps by the same names; empty if none were recorded.
         segments: the data set's own segments, in order.
-        meta: JSON-ready; ``meta["actions"]`` is the :class:`rsjax.tools.ingest.actions.Layout` of the actions.
+        meta: JSON-ready; ``meta["actions"]`` is the :class:`rsjax.tools.ingest.actions.ActionLayout` of the actions.
     """
 
     id: str

@@ -43,7 +43,7 @@ NOT_OF_METRICS = ("clips", "repetitions", "action_draws", "batch_size")
 
 
 @dataclass(frozen=True)
-class Request:
+class EvaluationRequest:
     """The settings of an evaluation.
 
     Attributes:
@@ -68,7 +68,7 @@ class Request:
     retakes: bool = False
 
 
-def evaluate_run(directory: Path, data: Path, request: Request) -> Iterator[Path]:
+def evaluate_run(directory: Path, data: Path, request: EvaluationRequest) -> Iterator[Path]:
     """Evaluates one run, each split by itself; skips results that are up to date. All processes call it together.
 
     A saved model is scored on the clips in it, without the scores that training clips are needed for.

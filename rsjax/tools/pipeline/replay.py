@@ -25,7 +25,7 @@ from rsjax.training.step import combine
 
 
 @dataclass(frozen=True)
-class Clip:
+class ReplayedClip:
     """One clip of a replayed batch.
 
     Attributes:
@@ -41,7 +41,7 @@ class Clip:
         return all(map(np.isfinite, self.scalars.values()))
 
 
-def replay(run: Run, stage: Literal["tokenizer", "world_model"], step: int) -> Iterator[Clip]:
+def replay(run: Run, stage: Literal["tokenizer", "world_model"], step: int) -> Iterator[ReplayedClip]:
     """Yields the clips of a skipped step's batch, scored one by one with the random draws of that step.
 
     The parameters are those of the newest checkpoint, at that step or near it; without one, the initial parameters.
@@ -75,7 +75,7 @@ def replay(run: Run, stage: Literal["tokenizer", "world_model"], step: int) -> I
         part = jax.tree.map(itemgetter(number), clips)
         context = StepContext(jnp.int32(step - 1), state.extra, None)
         scalars = _measure(model, state.params, part, key, context)
-        yield Clip(source, {name: float(value) for name, value in scalars.items()})
+        yield ReplayedClip(source, {name: float(value) for name, value in scalars.items()})
 
 
 @partial(jax.jit, static_argnums=0)

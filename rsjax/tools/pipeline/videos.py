@@ -34,7 +34,7 @@ DEMO_FPS = 4.0
 
 
 @dataclass(frozen=True)
-class Request:
+class VideoRequest:
     """The clips, actions and settings to generate with.
 
     Attributes:
@@ -57,7 +57,7 @@ class Request:
 def write_videos(
     run: Path,
     data: Path,
-    request: Request,
+    request: VideoRequest,
     out: Path,
     kind: Literal["mp4", "gif"],
     fps: float,
@@ -156,7 +156,7 @@ def write_demo(model: Path, data_dir: Path, out: Path, number: int | None = None
     return [video, strip]
 
 
-def chosen_clips(request: Request, source: Source) -> tuple[int, ...]:
+def chosen_clips(request: VideoRequest, source: Source) -> tuple[int, ...]:
     """Returns the numbers of the clips to generate.
 
     Raises:
@@ -175,7 +175,7 @@ def chosen_clips(request: Request, source: Source) -> tuple[int, ...]:
     return clips
 
 
-def _foreign_actions(request: Request, source: Source, config: Config) -> Float[np.ndarray, "T A"] | None:
+def _foreign_actions(request: VideoRequest, source: Source, config: Config) -> Float[np.ndarray, "T A"] | None:
     if request.actions_from is not None:
         return source[request.actions_from]["actions"]
     if request.actions is None:

@@ -19,7 +19,7 @@ Say = Callable[[str, bool], None]  # a line for the person who waits, and whethe
 
 
 @dataclass(eq=False)
-class Work:
+class FrameRequest:
     """One frame to generate.
 
     Attributes:
@@ -65,7 +65,7 @@ class Engine:
         self.frames = 0
         self._model = model
         self._branching: dict[bool, Branching] = {}
-        self._waiting: deque[Work] = deque()
+        self._waiting: deque[FrameRequest] = deque()
         self._compiled: set[tuple[bool, tuple[int, int, bool]]] = set()
         self._wake = threading.Condition()
         self._closed = False
@@ -85,7 +85,7 @@ class Engine:
         """Returns a clip's first frame, (1, 1, …), with depth or without."""
         return self.branching(first.depth is not None).begin(first)
 
-    def submit(self, work: Work) -> "Future[BranchState]":
+    def submit(self, work: FrameRequest) -> "Future[BranchState]":
         """Requests a frame.
 
         Raises:
@@ -138,7 +138,7 @@ class Engine:
             for work, state in zip(works, states, strict=True):
                 work.done.set_result(state)
 
-    def _advance(self, works: list[Work]) -> list[BranchState]:
+    def _advance(self, works: list[FrameRequest]) -> list[BranchState]:
         key = works[0].key
         fresh = works[0].key not in self._compiled
         if fresh:
@@ -159,13 +159,15 @@ def warm_up(engine: Engine, first: Video, width: int, decoding: Decoding) -> flo
     seconds = 0.0
     for _ in range(2):
         began = time.monotonic()
-        work = Work(state, np.zeros(width, np.float32), decoding, first.depth is not None, lambda text, busy: None)
+        work = FrameRequest(
+            state, np.zeros(width, np.float32), decoding, first.depth is not None, lambda text, busy: None
+        )
         state = engine.submit(work).result()
         seconds = time.monotonic() - began
     return seconds
 
 
-def _tell(works: list[Work], text: str, busy: bool) -> None:
+def _tell(works: list[FrameRequest], text: str, busy: bool) -> None:
     for work in works:
         with suppress(RuntimeError):  # the server has stopped
             work.say(text, busy)

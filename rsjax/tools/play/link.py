@@ -16,7 +16,7 @@ from PIL import Image
 from rsjax.models.branch_states import Decoding
 from rsjax.tools.play.messages import TEXT_BYTES, Refused, parse_json, whole
 from rsjax.tools.play.pictures import MOST_SIDE, Upload, read_picture
-from rsjax.tools.play.session import MOST_BRANCHES, MOST_SEED, Session, Settings, Start
+from rsjax.tools.play.session import MOST_BRANCHES, MOST_SEED, SampleSettings, Session, Start
 
 VERSION = 1
 MOST_TEXT = TEXT_BYTES - 1024  # characters, because a link must fit into one message
@@ -44,7 +44,7 @@ class Saved:
 
     start: Start
     seed: int
-    settings: Settings
+    settings: SampleSettings
     branches: list[SavedBranch]
     lanes: int
 

@@ -13,7 +13,7 @@ from rsjax.clip import Video
 from rsjax.config import Config
 from rsjax.data.codec import Record
 from rsjax.models.branch_states import BranchState, Decoding
-from rsjax.tools.play.engine import Engine, Work
+from rsjax.tools.play.engine import Engine, FrameRequest
 from rsjax.tools.play.messages import Refused, number, whole
 from rsjax.tools.play.pictures import Upload
 from rsjax.tools.play.play_run import PlayRun
@@ -30,7 +30,7 @@ FRAME_BYTES = 256 * 2**20  # of a session's pictures; for large pictures this lo
 
 
 @dataclass(frozen=True)
-class Settings:
+class SampleSettings:
     """Settings that a page can change: those of :class:`rsjax.config.SampleConfig`."""
 
     temperature: float
@@ -46,7 +46,7 @@ class Settings:
         """Returns how the next frame is decoded."""
         return Decoding(self.steps, self.temperature, self.guidance, self.top_k, seed, draw)
 
-    def changed(self, message: dict[str, Any], limits: dict[str, Any]) -> "Settings":
+    def changed(self, message: dict[str, Any], limits: dict[str, Any]) -> "SampleSettings":
         """Returns the settings with the fields that a message changes.
 
         Raises:
@@ -65,10 +65,10 @@ class Settings:
             raise Refused("bad_settings", error.message) from error
 
 
-def first_settings(config: Config) -> Settings:
+def first_settings(config: Config) -> SampleSettings:
     """Returns the run's own settings."""
     sample: Any = config.model.sample  # type: ignore[attr-defined]  # every family that branches has it
-    return Settings(float(sample.temperature), sample.steps, float(sample.guidance), sample.top_k)
+    return SampleSettings(float(sample.temperature), sample.steps, float(sample.guidance), sample.top_k)
 
 
 def settings_limits(config: Config) -> dict[str, Any]:
@@ -252,7 +252,7 @@ class Session:
         def say(text: str, busy: bool) -> None:
             loop.call_soon_threadsafe(self.send, {"type": "status", "text": text, "busy": busy})
 
-        work = Work(state, action, how, self.has_depth, say)
+        work = FrameRequest(state, action, how, self.has_depth, say)
         made = await asyncio.wrap_future(self.engine.submit(work))
         self.used = time.monotonic()
         return made

@@ -28,7 +28,7 @@ from rsjax.tools.play.session import first_settings
 from rsjax.tools.policies.judges.judge_training import judge_of
 from rsjax.tools.policies.worlds.environments import WorldModelEnv
 from rsjax.tools.serve.listener import BoundedListener
-from rsjax.tools.serve.session import Session
+from rsjax.tools.serve.session import ClientSession
 from rsjax.tools.serve.shared_steps import SharedSteps
 from rsjax.tools.serve.wire import WireError, pack, unpack
 
@@ -186,7 +186,7 @@ class WorldServer:
             return
         try:
             connection.send(pack(self.metadata))
-            self.answer_messages(connection, Session(self.environment, self._frames))
+            self.answer_messages(connection, ClientSession(self.environment, self._frames))
         except TimeoutError:
             connection.close(1001, f"no message for {self._settings.idle_minutes:g} minutes")
         except (ConnectionClosed, CancelledError, EngineClosedError):
@@ -194,7 +194,7 @@ class WorldServer:
         finally:
             self._places.release()
 
-    def answer_messages(self, connection: ServerConnection, session: Session) -> None:
+    def answer_messages(self, connection: ServerConnection, session: ClientSession) -> None:
         """Answers a client's messages, one after another, until too many in a row make no sense."""
         strikes = 0
         while strikes < STRIKES:

@@ -18,7 +18,7 @@ MOST_SEED = 2**32 - 1
 MOST_DRAW = 2**31 - 1
 
 
-class Session:
+class ClientSession:
     """The episode of one client.
 
     Args:

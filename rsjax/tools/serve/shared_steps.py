@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 
 from rsjax.clip import Video
 from rsjax.models.branch_states import BranchState, Decoding
-from rsjax.tools.play.engine import Engine, Work
+from rsjax.tools.play.engine import Engine, FrameRequest
 
 
 class SharedSteps:
@@ -39,7 +39,7 @@ class SharedSteps:
     def step(self, actions: Float[np.ndarray, "1 A"]) -> Video:
         assert self._state is not None, "restart the clip first"
         decoding = replace(self._decoding, draw=self._draw)
-        work = Work(self._state, actions[0], decoding, self._has_depth, lambda text, busy: None)
+        work = FrameRequest(self._state, actions[0], decoding, self._has_depth, lambda text, busy: None)
         self._state = self._engine.submit(work).result()
         return self._frame(self._state)
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from rsjax.tools.sim.expert import CLOSE, OPEN, TABLE_HEIGHT, State
+from rsjax.tools.sim.expert import CLOSE, OPEN, TABLE_HEIGHT, LiftState
 
 FRAMES = 60  # of a drive, the first one included
 # Bounds of the goal position, metres: what the camera "near" shows of the table, and of the space above it.
@@ -48,7 +48,7 @@ class Driver:
         self._action[6] = OPEN
         self._left = 0  # control steps of the stroke
 
-    def act(self, state: State) -> Float[np.ndarray, " 7"]:
+    def act(self, state: LiftState) -> Float[np.ndarray, " 7"]:
         """Returns the next action."""
         rng = self._rng
         if self._left == 0:  # a new stroke: along one, two or three of the axes, or the last stroke reversed

@@ -20,7 +20,7 @@ TURN_GAIN = 1.5  # action per radian
 
 
 @dataclass(frozen=True)
-class Arm:
+class ArmState:
     """What every expert of the Panda arm observes: positions in metres in the world, yaws in radians.
 
     Attributes:
@@ -35,7 +35,7 @@ class Arm:
 
 
 @dataclass(frozen=True)
-class State(Arm):
+class LiftState(ArmState):
     """The observation of Lift's expert: the arm, and the cube's position and yaw."""
 
     cube: Float[np.ndarray, " 3"]
@@ -97,7 +97,7 @@ def draw_manner(rng: np.random.Generator) -> Manner:
 
 
 class Expert:
-    """The policy of one episode: :class:`State` → 7-D action in [-1, 1].
+    """The policy of one episode: :class:`LiftState` → 7-D action in [-1, 1].
 
     Args:
         manner: its behaviour.
@@ -115,7 +115,7 @@ class Expert:
         self._finger = OPEN
         self._until = 0
 
-    def act(self, state: State) -> Float[np.ndarray, " 7"]:
+    def act(self, state: LiftState) -> Float[np.ndarray, " 7"]:
         """Returns the next action."""
         explores = self.manner.mode == "explore"
         if explores:
@@ -146,7 +146,7 @@ class Expert:
         self._phase = phase
         self._phase_step = 0
 
-    def _pick(self, state: State) -> tuple[Float[np.ndarray, " 3"], float]:
+    def _pick(self, state: LiftState) -> tuple[Float[np.ndarray, " 3"], float]:
         """Returns target and finger action by phase: hover, descend, grasp, carry, release."""
         manner = self.manner
         grasp = state.cube + np.array(manner.offset)
@@ -168,7 +168,7 @@ class Expert:
         return targets.get(self._phase, self._goal), CLOSE if self._phase in ("grasp", "carry") else OPEN
 
 
-def yaw_action(state: State) -> float:
+def yaw_action(state: LiftState) -> float:
     """Returns the turn about the vertical that brings the fingers parallel to the cube's sides."""
     # the cube looks the same after a quarter turn
     error = (state.cube_yaw - state.gripper_yaw + np.pi / 4) % (np.pi / 2) - np.pi / 4

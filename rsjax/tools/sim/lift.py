@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
-from rsjax.tools.sim.expert import TABLE_HEIGHT, Expert, State, draw_manner
+from rsjax.tools.sim.expert import TABLE_HEIGHT, Expert, LiftState, draw_manner
 from rsjax.tools.sim.panda import PandaSim, yaw_of
 
 TASK = "lift the red cube"
@@ -41,9 +41,9 @@ class LiftSim(PandaSim):
         return Expert(draw_manner(rng), rng)
 
     @property
-    def state(self) -> State:
+    def state(self) -> LiftState:
         gripper, rotation = self.gripper
-        return State(
+        return LiftState(
             gripper=gripper,
             goal=self._goal.copy(),
             gripper_yaw=yaw_of(rotation),

@@ -11,7 +11,7 @@ from xml.etree import ElementTree
 import numpy as np
 from jaxtyping import Float
 
-from rsjax.tools.sim.expert import CLOSE, OPEN, TABLE_HEIGHT, Arm
+from rsjax.tools.sim.expert import CLOSE, OPEN, TABLE_HEIGHT, ArmState
 from rsjax.tools.sim.panda import PandaSim, table_scene, yaw_of
 from rsjax.tools.sim.recipes.script import Moves, Scripted, go, stay, towards
 from rsjax.tools.sim.scenery import SEEN, Variation
@@ -52,7 +52,7 @@ HIGH = np.array([0.1, 0.16, TABLE_HEIGHT + 0.2])
 
 
 @dataclass(frozen=True)
-class RopeState(Arm):
+class RopeState(ArmState):
     """The observation of the rope's expert: the arm, the links' centres, and the directions along which they lie."""
 
     links: Float[np.ndarray, "N 3"]

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rsjax.config.sim import TABLETOP_TASKS
-from rsjax.tools.sim.expert import CLOSE, OPEN, TABLE_HEIGHT, Arm
+from rsjax.tools.sim.expert import CLOSE, OPEN, TABLE_HEIGHT, ArmState
 from rsjax.tools.sim.panda import TURN, PandaSim, table_scene, yaw_of
 from rsjax.tools.sim.recipes.script import Moves, Scripted, go, rest, stay, towards
 from rsjax.tools.sim.scenery import SEEN, Variation
@@ -39,7 +39,7 @@ STEPS = 150  # control steps of a demonstration at most
 
 
 @dataclass(frozen=True)
-class TabletopState(Arm):
+class TabletopState(ArmState):
     """The observation of the expert: the arm, and of each object its position, yaw and top, in metres and radians."""
 
     objects: Float[np.ndarray, "N 3"]

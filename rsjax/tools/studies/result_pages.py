@@ -21,7 +21,13 @@ from rsjax.tools.pipeline.run import Run
 from rsjax.tools.studies import run_results, softness
 from rsjax.tools.studies.paper.claim_tables import claim_content, claim_figure, claim_tables
 from rsjax.tools.studies.paper.report import RESULTS
-from rsjax.tools.studies.paper.result_files import KIND, about_result, content_key, merge_result, read_result
+from rsjax.tools.studies.paper.result_files import (
+    KIND,
+    about_result,
+    claim_result_key,
+    merge_claim_result,
+    read_claim_result,
+)
 from rsjax.tools.studies.tables import as_markdown
 from rsjax.tools.studies.transcribed import transcribed_table
 
@@ -50,7 +56,7 @@ def part_of(root: Path, name: str, part: str) -> str:
     content = read_json(path)
     below = ""
     if content["kind"] == KIND:
-        claim = claim_content(read_result(path))
+        claim = claim_content(read_claim_result(path))
         tables = claim_tables(claim)
         below = f"\n\n{claim['caption']} {about_result(path)}."
     elif content["kind"] == run_results.KIND:
@@ -86,7 +92,7 @@ def add_result(root: Path, study: Path, claim: str, name: str = "", *, merge: bo
         raise UserError(f"--add {claim!r}: {source}: no such file{did_you_mean(claim, known)} (rsjax paper writes it)")
     path = root / DATA / f"{name or claim}.json"
     if merge:
-        merge_result(path, source)
+        merge_claim_result(path, source)
         return path
     for suffix in (".json", ".npz"):
         path.with_suffix(suffix).unlink(missing_ok=True)
@@ -140,7 +146,7 @@ def _is_of(picture: Path, data: Path) -> bool:
     if not picture.exists():
         return False
     with Image.open(picture) as image:
-        return image.info.get("Source") == content_key(data)
+        return image.info.get("Source") == claim_result_key(data)
 
 
 def write_pages(root: Path) -> list[Path]:
@@ -153,7 +159,7 @@ def write_pages(root: Path) -> list[Path]:
             changed.append(page)
     for picture, data in figures(root):
         if not _is_of(picture, data):
-            write_file(picture, claim_figure(read_result(data), content_key(data)) or b"")
+            write_file(picture, claim_figure(read_claim_result(data), claim_result_key(data)) or b"")
             changed.append(picture)
     return changed
 

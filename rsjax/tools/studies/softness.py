@@ -62,7 +62,7 @@ class Options:
 
 
 @dataclass(frozen=True)
-class Score:
+class ShareRight:
     """The share of clips told right, and its 95 % interval over clips.
 
     Attributes:
@@ -162,7 +162,7 @@ def study(trained: TrainedModel, clips: Clips) -> dict[str, Any]:
     for name, hits in right.items():
         estimate = bootstrap(hits.astype(float))
         assert estimate.low is not None and estimate.high is not None
-        scores[name] = Score(estimate.value, estimate.low, estimate.high, float(hits[lifted].mean()))
+        scores[name] = ShareRight(estimate.value, estimate.low, estimate.high, float(hits[lifted].mean()))
     baseline = max(("pixels and their motion", "colour histogram"), key=lambda name: scores[name].accuracy)
     gain = bootstrap(right["model"].astype(float) - right[baseline])
     return {

@@ -12,7 +12,7 @@ from rsjax.models.roboscape.transformer import Transformer
 from rsjax.tokenizers import magvit2
 from rsjax.tokenizers.magvit2 import Tokenizer
 from rsjax.tools.convert.table import to_tensors
-from rsjax.tools.convert.tokenizer import table
+from rsjax.tools.convert.tokenizer import name_table
 
 torch = pytest.importorskip("torch")
 
@@ -99,7 +99,7 @@ def test_the_tokenizer_is_magvit2(changes: dict[str, Any]) -> None:
     drawn = noisy(Tokenizer(config).init_params(jax.random.key(0)))
     encoder = MagvitEncoderTorch(config)
     decoder = MagvitDecoderTorch(config)
-    tensors = {name: torch.tensor(np.ascontiguousarray(x)) for name, x in to_tensors(drawn, table(config)).items()}
+    tensors = {name: torch.tensor(np.ascontiguousarray(x)) for name, x in to_tensors(drawn, name_table(config)).items()}
     for name, half in (("encoder", encoder), ("decoder", decoder)):
         half.load_state_dict({key[8:]: x for key, x in tensors.items() if key.startswith(name)})
     images = np.random.default_rng(0).uniform(-1, 1, (2, 16, 16, 3)).astype(np.float32)

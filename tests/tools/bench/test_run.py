@@ -15,7 +15,7 @@ from rsjax.errors import UserError
 from rsjax.models.cogvideox.config import TextConfig
 from rsjax.models.cogvideox.text import texts_of
 from rsjax.tools.bench import parts
-from rsjax.tools.bench.run import PARTS, _shown, bench, ratios, table
+from rsjax.tools.bench.run import PARTS, _shown, bench, ratios, terminal_table
 from tests.models.cogvideox import toy as cogvideox
 
 
@@ -103,7 +103,7 @@ def test_rates_and_times_have_their_units(name: str, text: str) -> None:
 def test_the_table_has_a_row_for_every_key(numbers: dict[str, Any]) -> None:
     console = Console(width=120, file=io.StringIO())
     with console.capture() as shown:
-        console.print(table(numbers))
+        console.print(terminal_table(numbers))
     assert all(name in shown.get() for name in numbers)
 
 

@@ -14,7 +14,7 @@ from rsjax.errors import UserError
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.transformer import Transformer
 from rsjax.tools.convert.files import ConvertError
-from rsjax.tools.convert.genie import from_public, infer_config, read_settings, settings_of, table
+from rsjax.tools.convert.genie import from_public, infer_config, name_table, read_settings, settings_of
 from rsjax.tools.convert.table import public_shapes, to_tensors
 from tests.tools.convert.public import GenieNet, Tensors, genie_shapes, random_tensors
 
@@ -39,7 +39,7 @@ def source(tmp_path: Path) -> Path:
 @pytest.mark.parametrize("qk_norm", [False, True])
 def test_the_published_sizes_have_the_published_names_and_shapes(width: int, published: int, qk_norm: bool) -> None:
     config = Architecture(width=width, depth="none", action_inputs=0, public_code=PublicCodeConfig(qk_norm))
-    shapes = public_shapes(table(config), jax.eval_shape(Transformer(config).init_params, jax.random.key(0)))
+    shapes = public_shapes(name_table(config), jax.eval_shape(Transformer(config).init_params, jax.random.key(0)))
     assert shapes == genie_shapes(32, width, 8, 16, 256, 512, qk_norm)
     if not qk_norm:
         assert sum(int(np.prod(shape)) for shape in shapes.values()) == published
@@ -65,7 +65,7 @@ def test_the_converted_model_computes_what_the_published_one_does(qk_norm: bool,
 def test_export_inverts_import(qk_norm: bool) -> None:
     public = tensors(qk_norm)
     config, params = from_public(Path("file"), public, SETTINGS)
-    again = to_tensors(params, table(config))
+    again = to_tensors(params, name_table(config))
     assert again.keys() == public.keys()
     for name in public:
         assert again[name].dtype == public[name].dtype
@@ -184,4 +184,4 @@ def test_a_model_without_public_names_is_not_exported(fields: dict[str, Any]) ->
     config = replace(Architecture(width=16, blocks=2, heads=2, depth="none", action_inputs=0), **fields)
     params = jax.eval_shape(Transformer(config).init_params, jax.random.key(0))
     with pytest.raises(ConvertError, match="no name for these parts|cannot express model.departures.rotary"):
-        to_tensors(params, table(config))
+        to_tensors(params, name_table(config))

@@ -10,7 +10,7 @@ from rsjax.tokenizers import lfq
 from rsjax.tokenizers.magvit2 import Tokenizer, to_unit
 from rsjax.tools.convert.files import ConvertError
 from rsjax.tools.convert.table import public_shapes, to_tensors
-from rsjax.tools.convert.tokenizer import Weights, from_public, infer_config, public_name, table
+from rsjax.tools.convert.tokenizer import Weights, from_public, infer_config, name_table, public_name
 from tests.tools.convert.public import Tensors, TokenizerNet, random_tensors, tokenizer_shapes
 
 MULT = (1, 1, 2)
@@ -54,7 +54,7 @@ def test_both_published_sizes_have_the_published_names_and_shapes(
     res: int, adaptive: bool, encoder: tuple[int, int], decoder: tuple[int, int]
 ) -> None:
     config = TokenizerConfig(res_blocks=res, adaptive_norm=adaptive)
-    shapes = public_shapes(table(config), jax.eval_shape(Tokenizer(config).init_params, jax.random.key(0)))
+    shapes = public_shapes(name_table(config), jax.eval_shape(Tokenizer(config).init_params, jax.random.key(0)))
     assert shapes == tokenizer_shapes(128, (1, 1, 2, 2, 4), res, 18, adaptive)
     for part, published in (("encoder", encoder), ("decoder", decoder)):
         sizes = [math.prod(shape) for name, shape in shapes.items() if name.startswith(part)]
@@ -88,7 +88,7 @@ def test_a_training_checkpoint_yields_the_chosen_weights_and_counts_the_rest(gen
     everything, raw, ema = training_file(generation)
     config, params, ignored = from_public("file", everything, weights)
     wanted = {"raw": raw, "ema": ema}[weights]
-    assert equal(to_tensors(params, table(config)), wanted)
+    assert equal(to_tensors(params, name_table(config)), wanted)
     assert ignored["loss.discriminator"] == 2
     assert ignored["loss.perceptual_loss"] == 1
     assert ignored.total() == len(everything) - len(wanted)
@@ -97,16 +97,16 @@ def test_a_training_checkpoint_yields_the_chosen_weights_and_counts_the_rest(gen
 def test_a_tokenizer_with_local_codes_comes_back() -> None:
     config = TokenizerConfig(4, 32, (1, 2), 1, local_codes=True)
     params = jax.tree.map(np.asarray, Tokenizer(config).init_params(jax.random.key(0)))
-    written = to_tensors(params, table(config))
+    written = to_tensors(params, name_table(config))
     inferred, read, _ = from_public("file", written)
     assert inferred == config
-    assert equal(to_tensors(read, table(config)), written)
+    assert equal(to_tensors(read, name_table(config)), written)
 
 
 def test_half_precision_is_widened_exactly() -> None:
     half = {name: x.astype(np.float16) for name, x in tensors("older").items()}
     config, params, _ = from_public("file", half)
-    assert equal(to_tensors(params, table(config)), {name: x.astype(np.float32) for name, x in half.items()})
+    assert equal(to_tensors(params, name_table(config)), {name: x.astype(np.float32) for name, x in half.items()})
 
 
 @pytest.mark.parametrize("weights", ["raw", "ema"])

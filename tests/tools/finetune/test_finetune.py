@@ -28,7 +28,14 @@ from rsjax.tools.commands import describe
 from rsjax.tools.convert import genie, tokenizer
 from rsjax.tools.convert.directory import load_world_model
 from rsjax.tools.finetune.finetune import finetune, make_clips, prepare
-from rsjax.tools.finetune.recipe import FIXED_CAMERA, LEAST_BETWEEN, Finetuning, Reconstruction, finetuned, moving_share
+from rsjax.tools.finetune.recipe import (
+    FIXED_CAMERA,
+    LEAST_BETWEEN,
+    Finetuning,
+    ReconstructionScores,
+    finetuned,
+    moving_share,
+)
 from rsjax.tools.finetune.recordings import Cutting, Recordings, find_recordings
 from rsjax.tools.finetune.start import find_source
 from rsjax.tools.pipeline.run import Run
@@ -242,7 +249,7 @@ def test_the_best_weights_count_by_word(whole: Run, model: Path) -> None:
 
 @pytest.mark.parametrize(("psnr", "kept"), [(30.0, True), (22.0, False), (14.9, False)])
 def test_the_tokenizer_is_kept_where_it_beats_the_first_frame(psnr: float, kept: bool) -> None:
-    assert Reconstruction(psnr, repeat_first=20.0).good is kept
+    assert ReconstructionScores(psnr, repeat_first=20.0).good is kept
 
 
 def test_mistakes_are_one_line(model: Path, data: Path, tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from rsjax.config import ConfigError
-from rsjax.tools.ingest.actions import ActionConfig, Layout, align_actions, continuous_signs, sampled_actions
+from rsjax.tools.ingest.actions import ActionConfig, ActionLayout, align_actions, continuous_signs, sampled_actions
 from rsjax.tools.ingest.episode import EpisodeError
 
 FLOATS = st.floats(-10, 10, width=32)
@@ -31,21 +31,21 @@ def test_a_command_leads_into_the_next_frame() -> None:
 @given(ROWS)
 def test_every_frame_sampled_changes_nothing(rows: np.ndarray) -> None:
     rows = align_actions(rows)
-    for layout in (Layout("delta"), Layout("absolute"), Layout("delta", held=(0,))):
+    for layout in (ActionLayout("delta"), ActionLayout("absolute"), ActionLayout("delta", held=(0,))):
         np.testing.assert_array_equal(sampled_actions(rows, np.arange(len(rows)), EVERY, layout), rows)
 
 
 @given(ROWS, st.integers(1, 6))
 def test_deltas_of_skipped_frames_add_up_to_the_same_way(rows: np.ndarray, step: int) -> None:
     frames = np.arange(0, len(rows), step)
-    made = sampled_actions(rows, frames, EVERY, Layout("delta"))
+    made = sampled_actions(rows, frames, EVERY, ActionLayout("delta"))
     np.testing.assert_allclose(made.sum(0), rows[1 : frames[-1] + 1].sum(0, dtype=np.float64), atol=1e-3)
 
 
 @given(ROWS, st.integers(1, 6))
 def test_differences_lead_from_one_place_to_the_other(rows: np.ndarray, step: int) -> None:
     frames = np.arange(0, len(rows), step)
-    made = sampled_actions(rows, frames, ActionConfig(kind="delta"), Layout("absolute"))
+    made = sampled_actions(rows, frames, ActionConfig(kind="delta"), ActionLayout("absolute"))
     start = rows[1].astype(np.float64)  # row 0 is nothing, so the first place known is the one led into frame 1
     np.testing.assert_allclose((start + made.cumsum(0, dtype=np.float64))[1:], rows[frames[1:]], atol=1e-3)
 
@@ -53,31 +53,31 @@ def test_differences_lead_from_one_place_to_the_other(rows: np.ndarray, step: in
 def test_places_and_held_dimensions_keep_the_last_command() -> None:
     rows = np.array([[0, 0], [1, 0], [2, 1], [3, 1], [4, 0]], np.float32)
     frames = np.array([0, 2, 4])
-    assert sampled_actions(rows, frames, EVERY, Layout("absolute")).tolist() == [[0, 0], [2, 1], [4, 0]]
-    assert sampled_actions(rows, frames, EVERY, Layout("delta", held=(1,))).tolist() == [[0, 0], [3, 1], [7, 0]]
-    changed = sampled_actions(rows, frames, ActionConfig(kind="delta"), Layout("absolute", held=(1,)))
+    assert sampled_actions(rows, frames, EVERY, ActionLayout("absolute")).tolist() == [[0, 0], [2, 1], [4, 0]]
+    assert sampled_actions(rows, frames, EVERY, ActionLayout("delta", held=(1,))).tolist() == [[0, 0], [3, 1], [7, 0]]
+    changed = sampled_actions(rows, frames, ActionConfig(kind="delta"), ActionLayout("absolute", held=(1,)))
     assert changed.tolist() == [[0, 0], [1, 1], [2, 0]]
-    last = sampled_actions(rows, frames, ActionConfig(compose="last"), Layout("delta"))
+    last = sampled_actions(rows, frames, ActionConfig(compose="last"), ActionLayout("delta"))
     assert last.tolist() == [[0, 0], [2, 1], [4, 0]]
 
 
 def test_stacked_rows_are_all_there() -> None:
     rows = np.arange(14, dtype=np.float32).reshape(7, 2)
-    made = sampled_actions(rows, np.array([0, 3, 6]), ActionConfig(compose="stack"), Layout())
+    made = sampled_actions(rows, np.array([0, 3, 6]), ActionConfig(compose="stack"), ActionLayout())
     np.testing.assert_array_equal(made[1:], rows[1:].reshape(2, 6))
     assert not made[0].any()
     with pytest.raises(ConfigError, match="'stack', but frames are 1 to 3 apart"):
-        sampled_actions(rows, np.array([0, 1, 4]), ActionConfig(compose="stack"), Layout())
+        sampled_actions(rows, np.array([0, 1, 4]), ActionConfig(compose="stack"), ActionLayout())
 
 
 def test_an_offset_moves_commands_to_where_they_act() -> None:
     rows = np.array([[0], [1], [2], [3], [4]], np.float32)
     frames = np.arange(5)
-    late = sampled_actions(rows, frames, ActionConfig(offset=-1), Layout("absolute"))
-    early = sampled_actions(rows, frames, ActionConfig(offset=1), Layout("absolute"))
+    late = sampled_actions(rows, frames, ActionConfig(offset=-1), ActionLayout("absolute"))
+    early = sampled_actions(rows, frames, ActionConfig(offset=1), ActionLayout("absolute"))
     assert late[:, 0].tolist() == [0, 2, 3, 4, 4]
     assert early[:, 0].tolist() == [0, 1, 1, 2, 3]
-    steps = sampled_actions(rows, frames, ActionConfig(offset=-2), Layout("delta"))
+    steps = sampled_actions(rows, frames, ActionConfig(offset=-2), ActionLayout("delta"))
     assert steps[:, 0].tolist() == [0, 3, 4, 0, 0]
 
 
@@ -92,8 +92,8 @@ def test_turns_join_to_the_turn_from_end_to_end(turns: list[tuple[int, float]]) 
     frames = np.array([1, 4, 6])
     layout = (0,)
     expected = np.stack([(poses[1].inv() * poses[4]).as_quat(True), (poses[4].inv() * poses[6]).as_quat(True)])
-    joined = sampled_actions(steps, frames, EVERY, Layout("delta", layout))
-    differences = sampled_actions(places, frames, ActionConfig(kind="delta"), Layout("absolute", layout))
+    joined = sampled_actions(steps, frames, EVERY, ActionLayout("delta", layout))
+    differences = sampled_actions(places, frames, ActionConfig(kind="delta"), ActionLayout("absolute", layout))
     np.testing.assert_allclose(joined[1:], expected, atol=1e-5)
     np.testing.assert_allclose(differences[1:], expected, atol=1e-5)
 
@@ -112,7 +112,7 @@ def test_signs_of_quaternions_do_not_change_what_leads_from_one_to_the_other(fli
     signs = np.where(flips, -1.0, 1.0)[:, None].astype(np.float32)
     config = ActionConfig(compose=compose, kind="delta")  # type: ignore[arg-type]
     frames = np.arange(1, 6, 2)
-    layout = Layout("absolute", (0,))
+    layout = ActionLayout("absolute", (0,))
     made = sampled_actions(smooth * signs, frames, config, layout)
     np.testing.assert_allclose(made, sampled_actions(smooth, frames, config, layout), atol=1e-6)
 
@@ -122,15 +122,15 @@ def test_what_does_not_fit_is_reported() -> None:
     with pytest.raises(ConfigError, match="actions.compose is 'sum'; choose one of join, last, stack"):
         ActionConfig(compose="sum")  # type: ignore[arg-type]
     for config, layout, message in (
-        (ActionConfig(kind="absolute"), Layout("delta"), "the source records deltas"),
-        (EVERY, Layout("absolute", quaternions=(2,)), "names dimension 2, but actions have 2"),
-        (EVERY, Layout("delta", held=(-1,)), "names dimension -1, but actions have 2"),
+        (ActionConfig(kind="absolute"), ActionLayout("delta"), "the source records deltas"),
+        (EVERY, ActionLayout("absolute", quaternions=(2,)), "names dimension 2, but actions have 2"),
+        (EVERY, ActionLayout("delta", held=(-1,)), "names dimension -1, but actions have 2"),
     ):
         with pytest.raises((ConfigError, EpisodeError), match=message):
             sampled_actions(rows, np.arange(3), config, layout)
 
 
 def test_a_layout_survives_json() -> None:
-    layout = Layout("absolute", (6, 10), (14, 15))
-    assert Layout.from_json(json.loads(json.dumps(layout.to_json()))) == layout
-    assert Layout.from_json({}) == Layout()
+    layout = ActionLayout("absolute", (6, 10), (14, 15))
+    assert ActionLayout.from_json(json.loads(json.dumps(layout.to_json()))) == layout
+    assert ActionLayout.from_json({}) == ActionLayout()

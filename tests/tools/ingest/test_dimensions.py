@@ -5,8 +5,8 @@ from hypothesis import strategies as st
 
 from rsjax.tools.ingest.actions import (
     ActionConfig,
+    ActionLayout,
     Kind,
-    Layout,
     check_declared,
     describe_dimensions,
     flat_names,
@@ -57,9 +57,9 @@ def test_steps_that_stop_now_and_then_pass(seed: int, size: float, count: int) -
 
 def test_what_is_declared_is_believed() -> None:
     grip = (np.arange(COUNT) > 30)[:, None].astype(np.float32)
-    assert layout_of(grip, "delta", ()) == Layout("delta")
-    assert layout_of(grip, "delta", (0,)) == Layout("delta", held=(0,))
-    assert layout_of(grip, "absolute", None) == Layout("absolute")
+    assert layout_of(grip, "delta", ()) == ActionLayout("delta")
+    assert layout_of(grip, "delta", (0,)) == ActionLayout("delta", held=(0,))
+    assert layout_of(grip, "absolute", None) == ActionLayout("absolute")
     assert layout_of(grip, None, None).kind == "undeclared"
 
 
@@ -70,11 +70,11 @@ def test_names_of_dimensions() -> None:
 
 
 def test_each_dimension_is_described() -> None:
-    layout = Layout("absolute", (0,), (4,))
+    layout = ActionLayout("absolute", (0,), (4,))
     names = ["x", "y", "z", "w", "grip"]
     assert describe_dimensions(layout, names, ActionConfig(), 5)[3:] == ["w (absolute, of a quaternion)", "grip (held)"]
     assert describe_dimensions(layout, (), ActionConfig(kind="delta"), 5)[3:] == ["(delta, of a quaternion)", "(held)"]
-    stacked = describe_dimensions(Layout("undeclared"), ["x"], ActionConfig(compose="stack"), 2)
+    stacked = describe_dimensions(ActionLayout("undeclared"), ["x"], ActionConfig(compose="stack"), 2)
     assert stacked == ["x (undeclared, row 0)", "x (undeclared, row 1)"]
 
 

@@ -31,7 +31,7 @@ from rsjax.tools.commands import compare as compare_command
 from rsjax.tools.pipeline import evaluation_clips as eval_clips
 from rsjax.tools.pipeline import evaluations
 from rsjax.tools.pipeline.evaluation_clips import evaluation_store, longer_episodes, probes_of
-from rsjax.tools.pipeline.evaluations import Request, evaluate_own, evaluate_run
+from rsjax.tools.pipeline.evaluations import EvaluationRequest, evaluate_own, evaluate_run
 from rsjax.tools.pipeline.run import Run
 from rsjax.tools.pipeline.run_clips import on_store
 from rsjax.tools.sim import retakes
@@ -95,7 +95,7 @@ def zeros(config: Config) -> Any:
 
 
 def evaluated(run: Run, overwrite: bool = False, **changes: Any) -> list[Path]:
-    wanted = Request("paper", CHANGES | changes, overwrite=overwrite)
+    wanted = EvaluationRequest("paper", CHANGES | changes, overwrite=overwrite)
     return list(evaluate_run(run.directory, run.data_directory, wanted))
 
 
@@ -165,7 +165,9 @@ def test_other_weights_of_a_metric_at_the_same_path_are_evaluated_anew(
 
     def evaluated(name: str) -> str:
         settings = {"weights": str(tmp_path / name)}
-        return read_result(*evaluate_run(run.directory, run.data_directory, Request("run", settings=settings))).key
+        return read_result(
+            *evaluate_run(run.directory, run.data_directory, EvaluationRequest("run", settings=settings))
+        ).key
 
     (tmp_path / "i3d").mkdir()
     (tmp_path / "i3d" / fvd.FILE).write_bytes(b"1")
@@ -184,7 +186,7 @@ def test_results_of_other_stores_stay_apart_and_in_the_run(run: Run, folder: Pat
         path = shutil.copytree(run.clips, tmp_path / name)
         manifest = json.loads((path / "manifest.json").read_text())
         write_json(path / "manifest.json", manifest | {"key": key})
-        (made,) = evaluate_run(run.directory, run.data_directory, Request("paper", CHANGES, data=path))
+        (made,) = evaluate_run(run.directory, run.data_directory, EvaluationRequest("paper", CHANGES, data=path))
         return made
 
     made = {
@@ -244,7 +246,7 @@ def test_the_evaluation_stage_writes_such_a_file_too(run: Run) -> None:
 
 def test_second_takes_are_a_result_of_their_own(run: Run, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(UserError, match="clips: these clips were not simulated, so there is no second take of them"):
-        list(evaluate_run(run.directory, run.data_directory, Request("paper", CHANGES, retakes=True)))
+        list(evaluate_run(run.directory, run.data_directory, EvaluationRequest("paper", CHANGES, retakes=True)))
     takes: list[np.ndarray] = []
     whole = [{"rgb": np.full((FRAMES + 2, 8, 8, 3), i, np.uint8)} for i in range(toy.TEST)]
     monkeypatch.setattr(retakes, "collect_second_takes", lambda clips, split, numbers, *_: [whole[i] for i in numbers])
@@ -256,21 +258,21 @@ def test_second_takes_are_a_result_of_their_own(run: Run, folder: Path, monkeypa
         return scored(*inputs)
 
     monkeypatch.setattr(evaluation, "evaluate", evaluate)
-    (with_takes,) = evaluate_run(run.directory, run.data_directory, Request("paper", CHANGES, retakes=True))
+    (with_takes,) = evaluate_run(run.directory, run.data_directory, EvaluationRequest("paper", CHANGES, retakes=True))
     np.testing.assert_array_equal(takes[0][:, -1, 0, 0, 0], range(toy.TEST))
     assert takes[0].shape[:2] == (toy.TEST, FRAMES), "cut to the protocol's frames"
     assert with_takes.name == f"{folder.name},second-takes"
     results = read_result(folder), read_result(with_takes)
     assert [each.settings.get("second_take_jitter") for each in results] == [None, retakes.JITTER]
     assert results[0].key != results[1].key
-    reconstructed = Request("1xgpt", {"prompt_frames": 2, "horizon": 2}, retakes=True)
+    reconstructed = EvaluationRequest("1xgpt", {"prompt_frames": 2, "horizon": 2}, retakes=True)
     with pytest.raises(UserError, match="protocol 1xgpt compares with reconstructions, of which there is no second"):
         list(evaluate_run(run.directory, run.data_directory, reconstructed))
 
 
 def test_a_protocol_changes_the_settings_of_sampling(run: Run) -> None:
     changes = {"prompt_frames": 2, "horizon": 2, "clips": 3}
-    (folder,) = evaluate_run(run.directory, run.data_directory, Request("1xgpt", changes))
+    (folder,) = evaluate_run(run.directory, run.data_directory, EvaluationRequest("1xgpt", changes))
     result = read_result(folder)
     assert folder.name == "1xgpt,prompt_frames=2,horizon=2,clips=3"
     assert (result.sampling["steps"], result.sampling["temperature"], result.sampling["unmask"]) == (2, 0.0, "random")
@@ -305,25 +307,43 @@ def test_a_comparison_of_a_run_with_itself(
 @pytest.mark.parametrize(
     ("request_", "says"),
     [
-        (Request("paper"), "predicts 15 frames after 1, so it takes clips of 16 frames; .* have 6: lower --horizon"),
-        (Request("paper", CHANGES, splits=("unseen",)), "no split 'unseen'; it has train, test: choose with --split"),
-        (Request("unseen", CHANGES), r"no split 'unseen\*'; it has train, test"),
-        (Request("paper", CHANGES, data=Path("nowhere")), "nowhere: not there"),
-        (Request("paper", CHANGES | {"depth_source": "estimator"}), "estimator needs a network .* --eval.depth-estim"),
         (
-            Request("paper", CHANGES | {"prompt_frames": 10**9}),
+            EvaluationRequest("paper"),
+            "predicts 15 frames after 1, so it takes clips of 16 frames; .* have 6: lower --horizon",
+        ),
+        (
+            EvaluationRequest("paper", CHANGES, splits=("unseen",)),
+            "no split 'unseen'; it has train, test: choose with --split",
+        ),
+        (EvaluationRequest("unseen", CHANGES), r"no split 'unseen\*'; it has train, test"),
+        (EvaluationRequest("paper", CHANGES, data=Path("nowhere")), "nowhere: not there"),
+        (
+            EvaluationRequest("paper", CHANGES | {"depth_source": "estimator"}),
+            "estimator needs a network .* --eval.depth-estim",
+        ),
+        (
+            EvaluationRequest("paper", CHANGES | {"prompt_frames": 10**9}),
             "clips of 1000000005 frames, each generated .* are more",
         ),
-        (Request("paper", CHANGES | {"samples": 9_999_999}), "each generated .* lower --clips, .* --samples, "),
-        (Request("paper", CHANGES | {"repetitions": 9_999_999}), "each generated .* --repetitions or --action-draws"),
-        (Request("paper", CHANGES | {"action_draws": 9_999_999}), "each generated .* --repetitions or --action-draws"),
-        (Request("paper", CHANGES | {"steps": 999_999}), r"steps is 999999, but a frame has \d+ cells"),
-        (Request("paper", {"resolution": 999}), "scores frames of 999 pixels per side; those of .*run have"),
-        (Request("paper", CHANGES | {"resolution": 1}), "resolution is 1; frames have at least 16 pixels"),
-        (Request("paper", CHANGES, {"weights": "nowhere"}), "eval.weights is nowhere: no such directory"),
+        (
+            EvaluationRequest("paper", CHANGES | {"samples": 9_999_999}),
+            "each generated .* lower --clips, .* --samples, ",
+        ),
+        (
+            EvaluationRequest("paper", CHANGES | {"repetitions": 9_999_999}),
+            "each generated .* --repetitions or --action-draws",
+        ),
+        (
+            EvaluationRequest("paper", CHANGES | {"action_draws": 9_999_999}),
+            "each generated .* --repetitions or --action-draws",
+        ),
+        (EvaluationRequest("paper", CHANGES | {"steps": 999_999}), r"steps is 999999, but a frame has \d+ cells"),
+        (EvaluationRequest("paper", {"resolution": 999}), "scores frames of 999 pixels per side; those of .*run have"),
+        (EvaluationRequest("paper", CHANGES | {"resolution": 1}), "resolution is 1; frames have at least 16 pixels"),
+        (EvaluationRequest("paper", CHANGES, {"weights": "nowhere"}), "eval.weights is nowhere: no such directory"),
     ],
 )
-def test_what_cannot_be_evaluated_is_one_line(run: Run, request_: Request, says: str) -> None:
+def test_what_cannot_be_evaluated_is_one_line(run: Run, request_: EvaluationRequest, says: str) -> None:
     with pytest.raises(UserError, match=says) as refused:
         list(evaluate_run(run.directory, run.data_directory, request_))
     assert "\n" not in str(refused.value)

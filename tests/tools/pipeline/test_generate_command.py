@@ -12,7 +12,7 @@ from rsjax.config import presets
 from rsjax.data.store import Source
 from rsjax.errors import UserError
 from rsjax.models.base import create_model
-from rsjax.tools.pipeline.videos import Request, chosen_clips
+from rsjax.tools.pipeline.videos import VideoRequest, chosen_clips
 from rsjax.training.checkpoint import save_weights
 from tests.tools.pipeline import toy
 from tests.tools.pipeline.conftest import Commands
@@ -104,6 +104,6 @@ def test_a_damaged_configuration_is_named(run: Path, command: Commands) -> None:
 
 
 def test_a_split_without_clips_is_named() -> None:
-    request = Request("test", (), None, None, None, {})
+    request = VideoRequest("test", (), None, None, None, {})
     with pytest.raises(UserError, match="^the test split has no clips; choose another with --split$"):
         chosen_clips(request, Source(Path("store"), "test", []))

@@ -18,12 +18,11 @@ from rsjax.evaluation.results import read_result
 from rsjax.model_directory import PRETRAINED, SHIPPED
 from rsjax.models.load_run import load_config
 from rsjax.tools.commands.evaluate import Options
-from rsjax.tools.pipeline.evaluations import Request as EvaluationRequest
-from rsjax.tools.pipeline.evaluations import evaluate_run
+from rsjax.tools.pipeline.evaluations import EvaluationRequest, evaluate_run
 from rsjax.tools.pipeline.provenance import record_start
 from rsjax.tools.pipeline.publishing import Publication, loss_of_rounding, predicted_psnr, publish
 from rsjax.tools.pipeline.run import Run
-from rsjax.tools.pipeline.videos import Request, write_demo, write_videos
+from rsjax.tools.pipeline.videos import VideoRequest, write_demo, write_videos
 from rsjax.tools.play.play_run import PlayRun
 from rsjax.tools.policies.run_data import RunData
 from rsjax.training.checkpoint import save_weights
@@ -95,7 +94,7 @@ def test_the_loss_of_rounding_is_the_difference_of_two_means(run: Run, published
 
 
 def test_videos_the_demo_and_the_playground_work_from_the_directory_alone(published: Path, tmp_path: Path) -> None:
-    request = Request("test", (1,), None, None, None, {})
+    request = VideoRequest("test", (1,), None, None, None, {})
     (written,) = write_videos(published, Path("nowhere"), request, tmp_path, "mp4", 4.0, 1)
     assert written.name == "test_001.mp4"
     video, strip = write_demo(published, Path("nowhere"), tmp_path / "demo", 1)

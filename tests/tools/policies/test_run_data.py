@@ -9,7 +9,7 @@ from rsjax.config import Config, presets, to_dict
 from rsjax.errors import UserError
 from rsjax.files import write_json
 from rsjax.tools.policies.judges.judge import HISTORY
-from rsjax.tools.policies.judges.trained_judge import Network, TrainedJudge
+from rsjax.tools.policies.judges.trained_judge import JudgeNetwork, TrainedJudge
 from rsjax.tools.policies.run_data import RunData, replicates, training_of
 
 
@@ -46,7 +46,7 @@ def test_runs_in_which_no_policy_can_act_are_named_before_any_training(tmp_path:
 def test_a_judge_of_frames_of_another_size_is_named(tmp_path: Path) -> None:
     first = run(tmp_path / "first", presets.debug())
     for side in (60, 64):  # networks with parameters of equal shapes
-        params = Network().init(jax.random.key(0), np.zeros((1, HISTORY, side, side, 3), np.uint8))["params"]
+        params = JudgeNetwork().init(jax.random.key(0), np.zeros((1, HISTORY, side, side, 3), np.uint8))["params"]
         TrainedJudge(params, 1.0, side).save(tmp_path / f"judge-{side}")
     first.judge(tmp_path / "judge-64")
     with pytest.raises(

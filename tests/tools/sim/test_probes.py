@@ -9,7 +9,7 @@ from rsjax.config import SimConfig, to_dict
 from rsjax.data.store import Store, encode_clip, open_store, write_store
 from rsjax.tools.sim.drives import SMOOTH, WORKSPACE, Drive
 from rsjax.tools.sim.episode import EpisodePlan, Replay, clip_seed, run_episode, source_name
-from rsjax.tools.sim.expert import CLOSE, State
+from rsjax.tools.sim.expert import CLOSE, LiftState
 from rsjax.tools.sim.grasps import STEPS, Grasp
 from rsjax.tools.sim.lift import LiftSim
 from rsjax.tools.sim.panda import STEP
@@ -71,7 +71,7 @@ def test_a_drive_is_smooth_reverses_reaches_the_edges_and_grips() -> None:
     actions = []
     goals = []
     for _ in range(2000):
-        actions.append(driver.act(State(goal, goal, 0.0, goal, 0.0)))
+        actions.append(driver.act(LiftState(goal, goal, 0.0, goal, 0.0)))
         goal = goal + STEP * actions[-1][:3]
         goals.append(goal)
     moves = np.array(actions)[:, :3]

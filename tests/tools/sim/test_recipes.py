@@ -14,7 +14,7 @@ from rsjax.data.store import encode_clip, open_store
 from rsjax.tools.sim.collect import collect, collection_key
 from rsjax.tools.sim.contacts import collect_contacts, contact_splits
 from rsjax.tools.sim.episode import EpisodePlan, clip_seed, run_episode
-from rsjax.tools.sim.expert import OPEN, State
+from rsjax.tools.sim.expert import OPEN, LiftState
 from rsjax.tools.sim.lift import LiftSim
 from rsjax.tools.sim.panda import REACH, STEP
 from rsjax.tools.sim.recipes.grasps import GROUP
@@ -104,7 +104,7 @@ def test_free_driving_reaches_all_edges_with_open_and_closed_fingers() -> None:
         goal = np.array([-0.1, 0.0, 1.0])
         actions = []
         for _ in range(STEPS):
-            actions.append(expert.act(State(goal, goal, 0.0, np.array([0, 0, 0.82]), 0.0)))
+            actions.append(expert.act(LiftState(goal, goal, 0.0, np.array([0, 0, 0.82]), 0.0)))
             goal = np.clip(goal + STEP * actions[-1][:3], *REACH)
             goals.append(goal)
         rows = np.array(actions)

@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Bool, Float32
 
 from rsjax.data.depth_color import RELATIVE_FAR, stretch
-from rsjax.tools.ingest.annotators.network import Network, checkout_module, library, load_weights, pretrained
+from rsjax.tools.ingest.annotators.network import NetworkAnnotator, checkout_module, library, load_weights, pretrained
 from rsjax.tools.ingest.annotators.protocols import CHUNK, AnnotationError, DepthMaps, in_chunks
 from rsjax.tools.ingest.episode import Depths, Episode, EpisodeError
 
@@ -143,7 +143,7 @@ def _extent(maps: Float32[np.ndarray, "N H W"]) -> tuple[float, float]:
 
 
 @dataclass(frozen=True)
-class VideoDepthAnything(Network):
+class VideoDepthAnything(NetworkAnnotator):
     """Video Depth Anything (Chen et al. 2025) on a whole episode at once, so that its frames agree.
 
     Attributes:
@@ -189,7 +189,7 @@ class VideoDepthAnything(Network):
 
 
 @dataclass(frozen=True)
-class DepthAnything(Network):
+class DepthAnything(NetworkAnnotator):
     """DepthAnything (Yang et al. 2024) through transformers, frame by frame: relative depth may flicker.
 
     An episode's maps stay in the folder for temporary files until they are stored, 4 bytes a pixel.

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from rsjax.config import require
-from rsjax.tools.ingest.annotators.network import Network, library, load_weights
+from rsjax.tools.ingest.annotators.network import NetworkAnnotator, library, load_weights
 from rsjax.tools.ingest.annotators.protocols import Annotator, FlowEstimator, Motion, Pictures, in_chunks
 from rsjax.tools.ingest.episode import Frames
 
@@ -77,7 +77,7 @@ def measure_motion(frames: Frames, timestamps: Float[np.ndarray, " N"], flow: Fl
 
 
 @dataclass(frozen=True)
-class RaftFlow(Network):
+class RaftFlow(NetworkAnnotator):
     """RAFT; pictures are resized to sides that it accepts, and the flow is in pixels of the original ones.
 
     Attributes:

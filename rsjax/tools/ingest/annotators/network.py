@@ -17,7 +17,7 @@ EXTRA = "pip install 'rsjax[annotate]'"
 
 
 @dataclass(frozen=True)
-class Network(Annotator):
+class NetworkAnnotator(Annotator):
     """Base class of the methods that run a network, which is loaded once per process, at the first call.
 
     Attributes:
@@ -39,7 +39,7 @@ class Network(Annotator):
 
 
 @lru_cache(maxsize=5)  # one for each stage
-def _build(network: Network, versions: tuple[tuple[tuple[int, ...], ...], ...]) -> Any:
+def _build(network: NetworkAnnotator, versions: tuple[tuple[tuple[int, ...], ...], ...]) -> Any:
     library("torch", network.title)
     return network.build()
 

@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image
 
-from rsjax.tools.ingest.actions import Layout
-from rsjax.tools.ingest.annotators.network import Network, library, pretrained
+from rsjax.tools.ingest.actions import ActionLayout
+from rsjax.tools.ingest.annotators.network import NetworkAnnotator, library, pretrained
 from rsjax.tools.ingest.annotators.protocols import AnnotationError, Annotator, Semantic, Semantics
 from rsjax.tools.ingest.episode import Episode, Segment
 
@@ -88,7 +88,7 @@ def gripper_changes(episode: Episode, least: float) -> list[int]:
         least: a command that moves less than this over the whole episode is ignored.
     """
     changes = set[int]()
-    for dimension in Layout.from_json(episode.meta.get("actions", {})).held:
+    for dimension in ActionLayout.from_json(episode.meta.get("actions", {})).held:
         command = episode.actions[1:, dimension]  # row 0 of the actions is zeros
         if not len(command) or np.ptp(command) < least:
             continue
@@ -121,7 +121,7 @@ class Answer:
 
 
 @dataclass(frozen=True)
-class InternVL(Network):
+class InternVL(NetworkAnnotator):
     """InternVL, for the parts of an episode that the data set has no text for; :class:`OwnSemantics` does the others.
 
     Its key frame counts before the peak of motion, a gripper's before both.

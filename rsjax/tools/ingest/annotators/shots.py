@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from rsjax.tools.ingest.annotators.network import Network, library, on_device
+from rsjax.tools.ingest.annotators.network import NetworkAnnotator, library, on_device
 from rsjax.tools.ingest.annotators.protocols import Annotator, in_chunks
 from rsjax.tools.ingest.episode import Frames
 
@@ -85,7 +85,7 @@ def histogram_changes(frames: Frames) -> Float32[np.ndarray, " N"]:
 
 
 @dataclass(frozen=True)
-class TransNetShots(Network):
+class TransNetShots(NetworkAnnotator):
     """Cuts behind each run of frames that the network calls a transition; the run belongs to the shot before.
 
     Attributes:

@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from rsjax.config import require
 from rsjax.tools.ingest.annotators.network import (
-    Network,
+    NetworkAnnotator,
     checkout_module,
     library,
     load_weights,
@@ -220,7 +220,7 @@ def window_tracks(tracked: Tracked, frames: Int[np.ndarray, " T"] | Sequence[int
 
 
 @dataclass(frozen=True)
-class SpatialTracker(GridTracker, Network):
+class SpatialTracker(GridTracker, NetworkAnnotator):
     """SpatialTracker (Xiao et al. 2024), which lifts points into space by their depth. Needs CUDA.
 
     A point that is hidden at a span's end is dropped.
@@ -272,7 +272,7 @@ class SpatialTracker(GridTracker, Network):
 
 
 @dataclass(frozen=True)
-class BootsTapir(GridTracker, Network):
+class BootsTapir(GridTracker, NetworkAnnotator):
     """BootsTAPIR (Doersch et al. 2024), the PyTorch model of google-deepmind/tapnet.
 
     A point that is hidden at a span's end is dropped.

@@ -21,7 +21,7 @@ from jaxtyping import Float32, Float64, Int64
 
 from rsjax.clip import words_of
 from rsjax.files import safe_id
-from rsjax.tools.ingest.actions import Layout, align_actions, continuous_signs
+from rsjax.tools.ingest.actions import ActionLayout, align_actions, continuous_signs
 from rsjax.tools.ingest.episode import (
     LEAVE_OUT,
     Episode,
@@ -49,7 +49,7 @@ from rsjax.tools.ingest.video import VideoFrames
 
 FPS = 30.0
 CAMERAS = ("head", "hand_left", "hand_right")
-LAYOUT = Layout("absolute", quaternions=(6, 10), held=(14, 15))
+LAYOUT = ActionLayout("absolute", quaternions=(6, 10), held=(14, 15))
 _FOLDERS = ("observations", "proprio_stats")
 _WIDTHS = {
     "end/position": 6,

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from rsjax.files import safe_id
-from rsjax.tools.ingest.actions import Layout, align_actions
+from rsjax.tools.ingest.actions import ActionLayout, align_actions
 from rsjax.tools.ingest.episode import MAX_FPS, Episode, EpisodeError, EpisodeRef, SourceError, checked
 from rsjax.tools.ingest.formats.files import near
 from rsjax.tools.ingest.formats.tfrecord import Example, read_record, record_refs
@@ -94,7 +94,12 @@ class BairSource:
             actions=actions,
             states=states,
             cameras=cameras,
-            meta={"source": "bair", "file": ref.location["file"], "actions": Layout().to_json(), "fps_assumed": True},
+            meta={
+                "source": "bair",
+                "file": ref.location["file"],
+                "actions": ActionLayout().to_json(),
+                "fps_assumed": True,
+            },
         )
         return checked(episode, example.where)
 

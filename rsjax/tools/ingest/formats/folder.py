@@ -85,7 +85,8 @@ class FolderConfig:
         fps: frames per second; 0: as the videos or the timestamps say.
         after: whether each frame was recorded after the action of its row.
         action: the columns that are the action, in order; none: by their names.
-        kind: see :class:`rsjax.tools.ingest.actions.Layout`; None: not declared, so rows of actions are not combined.
+        kind: see :class:`rsjax.tools.ingest.actions.ActionLayout`; None: not declared, so rows of actions are not
+            combined.
         held: likewise.
         quaternions: likewise.
     """

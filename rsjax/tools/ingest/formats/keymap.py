@@ -22,7 +22,8 @@ class KeyMap:
         fps: steps per second, > 0; RLDS does not store it.
         state: features that make up the state, in order.
         task: text features; the first that is not empty counts.
-        kind: what the numbers of the action are, as in :class:`rsjax.tools.ingest.actions.Layout`; None: not declared.
+        kind: what the numbers of the action are, as in :class:`rsjax.tools.ingest.actions.ActionLayout`; None: not
+            declared.
         quaternions: likewise.
         held: likewise; None: not declared.
         after: whether a step's observation was recorded after its action, contrary to the convention.

@@ -72,8 +72,9 @@ def open_source(
     Args:
         action: the column of actions.
         state: the column of states; if it is missing, episodes have none.
-        kind: what the actions are, which the format does not say; see :class:`rsjax.tools.ingest.actions.Layout`. None:
-            absolute, unless the names of the dimensions contain ``delta``; then the kind has to be declared.
+        kind: what the actions are, which the format does not say; see
+            :class:`rsjax.tools.ingest.actions.ActionLayout`. None: absolute, unless the names of the dimensions contain
+            ``delta``; then the kind has to be declared.
         held: likewise.
         quaternions: likewise.
 

@@ -9,7 +9,7 @@
 ``success``     one value or [T]         optional: whether the task is done
 ``fps``         one number               frames per second
 ``task``        text                     optional
-``kind``        text                     optional: ``absolute`` or ``delta``, see ``actions.Layout``
+``kind``        text                     optional: ``absolute`` or ``delta``, see ``actions.ActionLayout``
 ==============  =======================  ===============================================================================
 """
 
@@ -77,7 +77,7 @@ def open_source(
         task: the task in files that name none.
         fps: frames per second in files that have neither ``fps`` nor ``timestamps``.
         after: whether each frame was recorded after the action of its row.
-        kind: kind of the actions in files that do not say; see ``actions.Layout``.
+        kind: kind of the actions in files that do not say; see ``actions.ActionLayout``.
         held: likewise.
         quaternions: likewise.
 

@@ -18,7 +18,7 @@ from jaxtyping import Float32
 from rsjax.clip import words_of
 from rsjax.errors import did_you_mean
 from rsjax.files import safe_id
-from rsjax.tools.ingest.actions import Layout, align_actions, continuous_signs
+from rsjax.tools.ingest.actions import ActionLayout, align_actions, continuous_signs
 from rsjax.tools.ingest.episode import LEAVE_OUT, Episode, EpisodeError, EpisodeRef, SourceError, checked, fingerprint
 from rsjax.tools.ingest.formats.files import broken, inside, location_of
 from rsjax.tools.ingest.formats.hdf5 import (
@@ -188,7 +188,7 @@ class DemoSource:
                     "demo": ref.location["demo"],
                     "environment": words_of(settings.get("env_name")),
                     "notes": {"flipped": flipped} if flipped else {},
-                    "actions": Layout(kind_of(settings), held=grippers).to_json(),
+                    "actions": ActionLayout(kind_of(settings), held=grippers).to_json(),
                 },
             )
             return checked(episode, f"{path}: data/{demo}")

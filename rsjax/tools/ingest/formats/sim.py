@@ -14,7 +14,7 @@ import numpy as np
 from rsjax.clip import UNKNOWN, words_of
 from rsjax.data.store import Record, Store, StoreError, open_store
 from rsjax.errors import did_you_mean
-from rsjax.tools.ingest.actions import Kind, Layout, layout_of
+from rsjax.tools.ingest.actions import ActionLayout, Kind, layout_of
 from rsjax.tools.ingest.episode import LEAVE_OUT, Episode, EpisodeError, EpisodeRef, SourceError, checked, fingerprint
 from rsjax.tools.ingest.pictures import ArrayFrames
 
@@ -31,7 +31,7 @@ def open_source(
         path: the store's directory.
         split: the only split to read; "": all.
         kind: kind of the actions in clips that no simulator of this project made; see
-            :class:`rsjax.tools.ingest.actions.Layout`.
+            :class:`rsjax.tools.ingest.actions.ActionLayout`.
         held: dimensions of these actions that stay in force, such as a gripper's; None: not declared.
 
     Raises:
@@ -119,7 +119,7 @@ class StoreSource:
                 last = width // steps - 1
             else:
                 last = width
-            layout = Layout("delta", held=tuple(range(last, width, width // steps or 1)))
+            layout = ActionLayout("delta", held=tuple(range(last, width, width // steps or 1)))
         measured = provenance.get("depth_unit", "metres") == "metres" and record.get("depth") is not None
         return Episode(
             id=ref.id,

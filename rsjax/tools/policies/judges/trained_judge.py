@@ -48,7 +48,7 @@ SPOILT = BATCH // 4
 CHUNK = 256  # histories in a forward pass, at most
 
 
-class Network(nn.Module):
+class JudgeNetwork(nn.Module):
     """Convolutions over a history's frames stacked as channels, then two linear layers."""
 
     @nn.compact
@@ -126,7 +126,7 @@ def load_judge(folder: Path, side: int | None = None) -> TrainedJudge:
             if not 0 < number <= MOST_SIDE:
                 raise ValueError(f"its {name} is {number}, not from 1 to {MOST_SIDE}")
         frames = jax.ShapeDtypeStruct((1, HISTORY, trained_on, trained_on, 3), np.uint8)
-        shapes = jax.eval_shape(Network().init, jax.random.key(0), frames)["params"]
+        shapes = jax.eval_shape(JudgeNetwork().init, jax.random.key(0), frames)["params"]
         wanted = {"/".join(names): x.shape for names, x in flatten_dict(shapes).items()}
         present = {name: np.shape(x) for name, x in record.items()}
         differing = sorted(name for name in present.keys() | wanted.keys() if present.get(name) != wanted.get(name))
@@ -211,7 +211,7 @@ def train_judge(footage: Footage, held: Footage, steps: int, seed: int = 0) -> T
         )
     rng = np.random.default_rng(seed)
     height = footage.rgb.shape[2]
-    params = Network().init(jax.random.key(seed), np.zeros((1, HISTORY, height, height, 3), np.uint8))["params"]
+    params = JudgeNetwork().init(jax.random.key(seed), np.zeros((1, HISTORY, height, height, 3), np.uint8))["params"]
     optimizer = optax.adam(optax.cosine_decay_schedule(2e-3, steps))
     state = optimizer.init(params)
 
@@ -293,7 +293,7 @@ def _temperature(params: Any, held: Footage, rng: np.random.Generator) -> float:
 
 @jax.jit
 def _logits(params: Any, frames: Array) -> Array:
-    return cast(Array, Network().apply({"params": params}, frames))
+    return cast(Array, JudgeNetwork().apply({"params": params}, frames))
 
 
 @jax.jit

@@ -145,8 +145,8 @@ def markdown(judge: dict[str, Any] | None) -> list[str]:
     for kind, part in judge.items():
         counts = [" / ".join(map(str, row)) if any(row) else ABSENT for row in part["confusion"]]
         rows.append([kind, *counts, f"{100 * part['right'][0]:.1f} %", f"{part['calibration_error']:.3f}"])
-    table = as_markdown(Table(("video", *LABELS, "right", "calibration error"), rows))
-    lines = ["", f"The judge on held-out clips (frames called {found}, by what they are):", "", table]
+    confusion_table = as_markdown(Table(("video", *LABELS, "right", "calibration error"), rows))
+    lines = ["", f"The judge on held-out clips (frames called {found}, by what they are):", "", confusion_table]
     if whole := whole_clips(judge):
         lines += ["", "Whole clips, by how many frames in a row must show success:", "", as_markdown(whole)]
     return lines
@@ -164,7 +164,7 @@ def whole_clips(result: dict[str, Any]) -> Table | None:
     return Table(("video", "frames", *(name.replace("_", " ") for name in OUTCOMES)), rows)
 
 
-def table(result: dict[str, Any]) -> Table:
+def confusion_table(result: dict[str, Any]) -> Table:
     """Returns a validation as a table: a row for each kind of video and true label."""
     rows = []
     for kind in KINDS:

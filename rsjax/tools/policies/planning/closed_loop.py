@@ -28,7 +28,7 @@ from rsjax.tools.policies.judges.judge_training import FOLDER
 from rsjax.tools.policies.judges.trained_judge import load_judge
 from rsjax.tools.policies.judges.validation import markdown, summary
 from rsjax.tools.policies.planning.energies import (
-    Seen,
+    RecentFrames,
     imagined,
     judged,
     lpips_distance,
@@ -112,7 +112,7 @@ class PlanningActor:
             depth = np.stack([each["depth"] for each in frames])
         else:
             depth = None
-        seen = Seen(np.stack([each["rgb"] for each in frames]), depth, np.stack(self._actions[-kept:]))
+        seen = RecentFrames(np.stack([each["rgb"] for each in frames]), depth, np.stack(self._actions[-kept:]))
         action = self._planner(seen).astype(np.float32)
         self._actions.append(action)
         self.seconds.append(time.monotonic() - began)
@@ -183,7 +183,7 @@ def actors(
     return ways
 
 
-def _proposals(policy: Policy, count: int, seed: int, seen: Seen) -> Float32[np.ndarray, "N F A"]:
+def _proposals(policy: Policy, count: int, seed: int, seen: RecentFrames) -> Float32[np.ndarray, "N F A"]:
     """Returns a policy's plans for what a planner has seen, with other draws at each frame."""
     return policy.plans(seen.rgb, count, zlib.crc32(seen.rgb.tobytes(), seed) >> 1)
 

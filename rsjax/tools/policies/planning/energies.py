@@ -26,7 +26,7 @@ Score: TypeAlias = Callable[[UInt8[np.ndarray, "N F S S 3"]], Float[np.ndarray, 
 
 
 @dataclass(frozen=True)
-class Seen:
+class RecentFrames:
     """What a planner has seen of an episode.
 
     Attributes:
@@ -43,7 +43,7 @@ class Seen:
 def imagined(model: TrainedModel, score: Score, frames: int = HISTORY) -> Energy:
     """Returns an energy: the score of the video that a world model generates for each candidate.
 
-    All candidates share the cache of the frames so far, and the random draws. The energy takes a :class:`Seen`.
+    All candidates share the cache of the frames so far, and the random draws. The energy takes a :class:`RecentFrames`.
 
     Args:
         frames: how many of the last frames the score looks at.
@@ -55,14 +55,14 @@ def imagined(model: TrainedModel, score: Score, frames: int = HISTORY) -> Energy
 def success(model: TrainedModel) -> Energy:
     """Returns an energy: 1 - the probability of success that the model's own head reads at each candidate's end.
 
-    It takes a :class:`Seen`, and decodes no picture but the last.
+    It takes a :class:`RecentFrames`, and decodes no picture but the last.
 
     Raises:
         UserError: the model has no state heads.
     """
     head_judge(model)
 
-    def energy(seen: Seen, candidates: Float[np.ndarray, "N H A"]) -> Float[np.ndarray, " N"]:
+    def energy(seen: RecentFrames, candidates: Float[np.ndarray, "N H A"]) -> Float[np.ndarray, " N"]:
         state = _planned(model, seen, candidates, 1).state
         assert state is not None
         return 1 - state[:, -1, STATE.index("success")].astype(np.float64)
@@ -70,7 +70,7 @@ def success(model: TrainedModel) -> Energy:
     return energy
 
 
-def _planned(model: TrainedModel, seen: Seen, candidates: Float[np.ndarray, "N H A"], frames: int) -> Video:
+def _planned(model: TrainedModel, seen: RecentFrames, candidates: Float[np.ndarray, "N H A"], frames: int) -> Video:
     """Returns the last frames of the videos that the model generates for the candidates."""
     before = np.repeat(seen.actions[None], len(candidates), axis=0)
     prompt = Video(seen.rgb[None], None if seen.depth is None else seen.depth[None])

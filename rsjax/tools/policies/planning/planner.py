@@ -67,7 +67,7 @@ class PlannerConfig:
 
 
 @dataclass(frozen=True)
-class Plan:
+class PlannedActions:
     """The result of a search.
 
     Attributes:
@@ -90,7 +90,7 @@ def search(
     config: PlannerConfig,
     rng: np.random.Generator,
     proposals: Float[np.ndarray, "N H A"] | None = None,
-) -> Plan:
+) -> PlannedActions:
     """Searches for the action sequence of least energy.
 
     Args:
@@ -139,7 +139,7 @@ def search(
             scale = config.temperature * max(float(energies[finite].std()), 1e-12)
             weights = np.exp(-(energies - energies[first]) / scale)
             mean = np.einsum("n,nha->ha", weights / weights.sum(), drawn)
-    return Plan(best.astype(np.float32), lowest, np.array(history))
+    return PlannedActions(best.astype(np.float32), lowest, np.array(history))
 
 
 class Planner:
@@ -180,7 +180,7 @@ class Planner:
 
     def reset(self) -> None:
         """Forgets the plan and resets the random draws, for another episode."""
-        self.plan: Plan | None = None
+        self.plan: PlannedActions | None = None
         self._rng = np.random.default_rng(self._config.seed)
 
     def __call__(self, frames: Any) -> Float[np.ndarray, " A"]:

@@ -23,7 +23,7 @@ from rsjax.evaluation.results import Result, read_result
 from rsjax.evaluation.statistics import Estimate, bootstrap, wilson
 from rsjax.files import read_json, write_file, write_json
 from rsjax.progress import note, stage
-from rsjax.tools.pipeline.evaluations import Request, evaluate_run
+from rsjax.tools.pipeline.evaluations import EvaluationRequest, evaluate_run
 from rsjax.tools.pipeline.prepared import prepare_store
 from rsjax.tools.pipeline.run import Run
 from rsjax.tools.pipeline.stages import run_all
@@ -273,7 +273,7 @@ def measure(
     results: list[dict[str, Any]] = []
     first: dict[str, Result] = {}
     for name, run in runs.items():
-        (folder,) = evaluate_run(run, data.data_dir, Request("run", data=held_out))
+        (folder,) = evaluate_run(run, data.data_dir, EvaluationRequest("run", data=held_out))
         found = {"own": scores_of(run), "on_policy": read_result(folder)}
         first = first or found
         row: dict[str, Any] = {"name": name, "run": str(run)}
@@ -291,11 +291,11 @@ def measure(
         compare(behaviour.policies, behaviour.simulator, worlds, trials, out / "policy_evaluation")
         about["success"] = read_json(out / "policy_evaluation" / "results.json")["runs"]
     write_json(out / "results.json", about)
-    write_file(out / "results.md", table(about).encode())
+    write_file(out / "results.md", adaptation_tables(about).encode())
     return about
 
 
-def table(results: Mapping[str, Any]) -> str:
+def adaptation_tables(results: Mapping[str, Any]) -> str:
     """Returns the results in Markdown: the scores before and after, and the policies' success."""
     scores = []
     for row in results["models"]:

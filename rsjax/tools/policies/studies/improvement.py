@@ -123,7 +123,7 @@ def improve(
         results = about | {"before": before.success, "clipped": before.clipped, "rounds": rows}
         results["differences"] = differences(results)
         write_json(out / "results.json", results)
-        write_file(out / "results.md", table(results).encode())
+        write_file(out / "results.md", rounds_table(results).encode())
         begin = (0.0, _share(before.success))
         series = {arm: [begin, *[(float(each["round"]), _share(each[arm])) for each in rows]] for arm in arms}
         write_file(out / "success.png", success_curves(series, "rounds"))
@@ -192,7 +192,7 @@ def differences(results: dict[str, Any]) -> list[dict[str, Any]]:
     return found
 
 
-def table(results: dict[str, Any]) -> str:
+def rounds_table(results: dict[str, Any]) -> str:
     """Returns the results in Markdown."""
     share = _share(results["before"])
     rows = [["0", "", "", "", "before", percent(share), interval_text(share)]]

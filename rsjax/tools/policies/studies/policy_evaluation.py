@@ -22,7 +22,7 @@ from rsjax.tools.policies.policy_training import train_policy
 from rsjax.tools.policies.studies.agreement import agreement, inner, over_trainings
 from rsjax.tools.policies.studies.figures import scatter, side_by_side
 from rsjax.tools.policies.studies.policy_learning import interval_text, percent
-from rsjax.tools.policies.studies.trials import FPS, Result, Trials, first_frames, try_policy
+from rsjax.tools.policies.studies.trials import FPS, TrialResult, Trials, first_frames, try_policy
 from rsjax.tools.policies.worlds.world import FIRST_SEED, World
 from rsjax.tools.studies.report.video import write_mp4
 from rsjax.tools.studies.tables import ABSENT, Table, as_markdown, number_text
@@ -135,7 +135,7 @@ def compare(
         raise UserError(f"--imagined is {imagined}; it must be at least --episodes, which is {trials.episodes}")
     seeds = [FIRST_SEED + number for number in range(imagined)]
     frames = first_frames(simulator, seeds, out / "starts.npz")
-    true: dict[str, Result] = {}
+    true: dict[str, TrialResult] = {}
     for name, policy in policies.items():
         true[name] = try_policy(
             policy,
@@ -173,7 +173,7 @@ def _videos(out: Path, run: str, name: str, trials: Trials) -> None:
 
 
 def compared(
-    run: str, true: Mapping[str, Result], imagined: Mapping[str, Result], training: Mapping[str, str]
+    run: str, true: Mapping[str, TrialResult], imagined: Mapping[str, TrialResult], training: Mapping[str, str]
 ) -> dict[str, Any]:
     """Returns a run's entry in ``results.json``: success in both worlds by policy, and how well they agree.
 
@@ -268,7 +268,7 @@ def write_results(out: Path, rows: Sequence[dict[str, Any]], trials: Trials) -> 
     """Writes ``results.json``, ``results.md`` and ``scatter.png`` of the runs that are finished."""
     results = results_of(rows, trials)
     write_json(out / "results.json", results)
-    write_file(out / "results.md", table(results).encode())
+    write_file(out / "results.md", agreement_tables(results).encode())
     points = {}
     titles = {}
     for row in rows:
@@ -301,7 +301,7 @@ def r_text(r: Mapping[str, float | None]) -> tuple[str, str]:
     return f"{r['value']:.3f}", f"{r['low']:.2f} … {r['high']:.2f}"
 
 
-def table(results: Mapping[str, Any]) -> str:
+def agreement_tables(results: Mapping[str, Any]) -> str:
     """Returns the results in Markdown: agreement, success, and the judges that decided success."""
     rows = results["runs"]
     agreements = []

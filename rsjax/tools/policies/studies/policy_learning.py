@@ -23,7 +23,7 @@ SAME = 0.1  # "as good as real demonstrations" allows a success rate that is low
 
 
 @dataclass(frozen=True)
-class Cell:
+class PolicyTraining:
     """One policy to train: the numbers of real and synthetic demonstrations, and a multiple of the usual steps."""
 
     name: str
@@ -50,7 +50,7 @@ class Learning:
         if not self.counts or min(self.counts) < 1 or self.seeds < 1:
             raise UserError(f"--counts {self.counts} and --seeds {self.seeds} must be 1 at least")
 
-    def chosen(self) -> list[Cell]:
+    def chosen(self) -> list[PolicyTraining]:
         """Returns the cells to run.
 
         For each number of ``counts`` there is a cell with that many synthetic demonstrations and, as a control of equal
@@ -62,9 +62,10 @@ class Learning:
         """
         counts = sorted(set(self.counts))
         most = max(self.counts)
-        cells = [Cell(f"synthetic-{count}", 0, count) for count in counts]
-        cells += [Cell(f"real-{count}", count, 0) for count in counts]
-        cells += [Cell(f"real-{most}-repeated", most, 0, 2), Cell(f"real-{most}-synthetic-{most}", most, most, 2)]
+        cells = [PolicyTraining(f"synthetic-{count}", 0, count) for count in counts]
+        cells += [PolicyTraining(f"real-{count}", count, 0) for count in counts]
+        cells.append(PolicyTraining(f"real-{most}-repeated", most, 0, 2))
+        cells.append(PolicyTraining(f"real-{most}-synthetic-{most}", most, most, 2))
         if unknown := set(self.cells) - {cell.name for cell in cells}:
             names = ", ".join(map(repr, sorted(unknown)))
             raise UserError(f"--cells: no cell {names}; there are {', '.join(cell.name for cell in cells)}")
@@ -108,7 +109,7 @@ def learn(
         rows.append(asdict(cell) | {"success": success, "clipped": clipped})
         results: dict[str, Any] = {"trials": asdict(trials), "rows": rows, "claims": claims(rows, max(settings.counts))}
         write_json(out / "results.json", results)
-        write_file(out / "results.md", table(rows, results["claims"]).encode())
+        write_file(out / "results.md", learning_tables(rows, results["claims"]).encode())
         series: dict[str, list[tuple[float, Estimate]]] = {}
         for row in rows:
             if row["real"] and row["synthetic"]:
@@ -124,7 +125,7 @@ def learn(
     return results
 
 
-def _demos(cell: Cell, real: Demos, synthetic: Demos) -> Demos:
+def _demos(cell: PolicyTraining, real: Demos, synthetic: Demos) -> Demos:
     parts = [source.first(count) for source, count in ((real, cell.real), (synthetic, cell.synthetic)) if count]
     if len(parts) == 1:
         return parts[0]
@@ -163,7 +164,7 @@ def claims(rows: Sequence[dict[str, Any]], most: int) -> list[dict[str, Any]]:
     return found
 
 
-def table(rows: Sequence[dict[str, Any]], found: Sequence[dict[str, Any]]) -> str:
+def learning_tables(rows: Sequence[dict[str, Any]], found: Sequence[dict[str, Any]]) -> str:
     """Returns the results in Markdown."""
     policies = []
     for row in rows:

@@ -21,7 +21,7 @@ from rsjax.tools.policies.judges.judge import FAIL, SUCCESS, UNINTERPRETABLE, Ju
 from rsjax.tools.policies.judges.people_and_vlms import SHEET, HumanJudge, LanguageJudge, video_name, write_blinded
 from rsjax.tools.policies.judges.validation import scores, summary
 from rsjax.tools.policies.studies.policy_evaluation import FIRST_TRAINING, compared, write_results
-from rsjax.tools.policies.studies.trials import Result, Trials
+from rsjax.tools.policies.studies.trials import TrialResult, Trials
 
 Rollouts = dict[str, list[UInt8[np.ndarray, "T S S 3"]]]  # by policy, one for each episode
 EVERY = 20  # verdicts are saved after each this many videos
@@ -74,7 +74,7 @@ def rejudge(out: Path, judge: Judge, name: str) -> Path:
     folder = out / f"judged-{name}"
     rollouts = _rollouts(out, results)
     policies = results["runs"][0]["policies"]
-    true = {name: Result(each["simulator"], each["clipped"]["simulator"]) for name, each in policies.items()}
+    true = {name: TrialResult(each["simulator"], each["clipped"]["simulator"]) for name, each in policies.items()}
     verdicts = _verdicts(rollouts, judge, folder, name)
     truth = np.concatenate([np.where(each.success, SUCCESS, FAIL) for each in true.values()])
     checked = scores(np.concatenate([verdicts["simulator"][policy] for policy in true]), truth)
@@ -82,7 +82,7 @@ def rejudge(out: Path, judge: Judge, name: str) -> Path:
     for row in results["runs"]:
         labels = {policy: found.argmax(-1) for policy, found in verdicts[row["run"]].items()}
         made = {
-            policy: Result(
+            policy: TrialResult(
                 (found == SUCCESS).tolist(),
                 row["policies"][policy]["clipped"]["world_model"],
                 (found == UNINTERPRETABLE).tolist(),

@@ -57,7 +57,7 @@ class Trials:
 
 
 @dataclass
-class Result:
+class TrialResult:
     """The results of a policy's trials.
 
     Attributes:
@@ -87,7 +87,7 @@ def try_policy(
     folder: Path,
     name: str,
     save_frames: int = 0,
-) -> Result:
+) -> TrialResult:
     """Runs a policy from each start, except those whose result is in ``folder`` already.
 
     Args:
@@ -129,7 +129,7 @@ def try_policy(
                 progress.update(len(success), success=sum(success))
     if len(unfamiliarity) < len(success):  # episodes that an older version or another command has run
         unfamiliarity = []
-    return Result(success, clipped, uninterpretable, unfamiliarity)
+    return TrialResult(success, clipped, uninterpretable, unfamiliarity)
 
 
 def open_lift(config: SimConfig, trials: Trials) -> AbstractContextManager[SimulatorWorld]:

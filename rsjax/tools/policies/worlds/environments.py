@@ -35,7 +35,7 @@ from rsjax.tools.policies.worlds.model_world import FirstFrame, ModelWorld
 from rsjax.tools.policies.worlds.simulator_world import SimulatorWorld
 from rsjax.tools.policies.worlds.starts import Starts
 from rsjax.tools.policies.worlds.world import Observation, WorldState
-from rsjax.tools.sim.expert import State
+from rsjax.tools.sim.expert import LiftState
 
 FAR = 10.0  # metres; nothing that the simulator's cameras see is farther
 MOST_STEPS = 10**6  # of an episode
@@ -462,9 +462,9 @@ class LiftEnv(gymnasium.Env[Any, Any]):
         return self._world.simulators[0].success
 
     @property
-    def state(self) -> State:
+    def state(self) -> LiftState:
         """Where gripper and cube are, for scripted policies."""
-        state: State = self._world.simulators[0].state
+        state: LiftState = self._world.simulators[0].state
         return state
 
     def reset(

@@ -21,7 +21,7 @@ from rsjax.models.trained import TrainedModel
 from rsjax.tools.policies.judges.head_judge import HeadJudge
 from rsjax.tools.policies.judges.judge import LABELS, SUCCESS, Judge, frames_of, judge_key
 from rsjax.tools.policies.worlds.actions import ActionRange, action_range
-from rsjax.tools.policies.worlds.world import Episode, WorldState
+from rsjax.tools.policies.worlds.world import EpisodeRecord, WorldState
 
 DRAWS = 2**20  # added to a clip's index at each step, so that steps differ in their draws; clip indices are smaller
 
@@ -137,7 +137,7 @@ class ModelWorld:
         self._observation = _last_frame(video, self._shows_depth)
         return self._state(rows, clipped)
 
-    def unfamiliarity(self, episodes: Sequence[Episode], frames: int) -> list[float]:
+    def unfamiliarity(self, episodes: Sequence[EpisodeRecord], frames: int) -> list[float]:
         if self._coverage is None:
             return []
         rgb = []

@@ -16,12 +16,12 @@ from jaxtyping import Bool, Float
 from rsjax.config import SimConfig, content_key, require
 from rsjax.progress import note
 from rsjax.tools.policies.worlds.actions import PANDA_UNIT, ActionRange
-from rsjax.tools.policies.worlds.world import Episode, WorldState
+from rsjax.tools.policies.worlds.world import EpisodeRecord, WorldState
 from rsjax.tools.sim.episode import Simulator
-from rsjax.tools.sim.expert import State
+from rsjax.tools.sim.expert import LiftState
 from rsjax.tools.sim.lift import LiftSim
 
-Control: TypeAlias = Callable[[State], Float[np.ndarray, " D"]]  # from the simulator's state, at each control step
+Control: TypeAlias = Callable[[LiftState], Float[np.ndarray, " D"]]  # from the simulator's state, at each control step
 
 
 class SimulatorWorld:
@@ -127,7 +127,7 @@ class SimulatorWorld:
                 self._look(number)
         return self._state(controls, clipped)
 
-    def unfamiliarity(self, episodes: Sequence[Episode], frames: int) -> list[float]:
+    def unfamiliarity(self, episodes: Sequence[EpisodeRecord], frames: int) -> list[float]:
         return []
 
     def _look(self, number: int) -> None:

@@ -83,7 +83,7 @@ class World(Protocol):
         """
         ...
 
-    def unfamiliarity(self, episodes: Sequence["Episode"], frames: int) -> list[float]:
+    def unfamiliarity(self, episodes: Sequence["EpisodeRecord"], frames: int) -> list[float]:
         """Returns how far episodes in a world model are from its training clips, as percentiles, 0 to 1.
 
         Empty in the simulator, and for a model whose distances are not measured.
@@ -95,7 +95,7 @@ class World(Protocol):
 
 
 @dataclass(frozen=True)
-class Episode:
+class EpisodeRecord:
     """The record of one episode in a world.
 
     Attributes:
@@ -115,7 +115,7 @@ class Episode:
     uninterpretable: bool = False
 
 
-def run_episodes(world: World, act: Actor, starts: Sequence[Any], steps: int) -> list[Episode]:
+def run_episodes(world: World, act: Actor, starts: Sequence[Any], steps: int) -> list[EpisodeRecord]:
     """Runs at most ``world.count`` episodes together, each until it succeeds or has had all its steps.
 
     Args:
@@ -144,7 +144,7 @@ def run_episodes(world: World, act: Actor, starts: Sequence[Any], steps: int) ->
         if "depth" in own[0].observation:
             depth = np.stack([state.observation["depth"][number] for state in own])
         verdict = own[-1].verdict
-        episode = Episode(
+        episode = EpisodeRecord(
             rgb=np.stack([state.observation["rgb"][number] for state in own]),
             depth=depth,
             actions=np.stack([state.actions[number] for state in own]),

@@ -9,9 +9,9 @@ from typing import Any, TypeAlias
 import numpy as np
 from jaxtyping import Float
 
-from rsjax.tools.sim.expert import GAIN, OPEN, Arm, State, next_noise, yaw_action
+from rsjax.tools.sim.expert import GAIN, OPEN, ArmState, LiftState, next_noise, yaw_action
 
-See: TypeAlias = Callable[[], State]  # returns the current state
+See: TypeAlias = Callable[[], LiftState]  # returns the current state
 Moves: TypeAlias = Iterator[Float[np.ndarray, " 7"]]  # the action of each control step
 
 
@@ -51,7 +51,7 @@ def rest(finger: float) -> Float[np.ndarray, " 7"]:
 
 
 def towards(
-    state: Arm, point: Float[np.ndarray, " 3"], finger: float, speed: float = 1.0, turn: float = 0.0
+    state: ArmState, point: Float[np.ndarray, " 3"], finger: float, speed: float = 1.0, turn: float = 0.0
 ) -> Float[np.ndarray, " 7"]:
     """Returns the action that moves the gripper's goal towards a point.
 
@@ -72,7 +72,12 @@ def stay(finger: float, steps: int) -> Moves:
 
 
 def go(
-    see: Callable[[], Arm], point: Float[np.ndarray, " 3"], finger: float, speed: float, steps: int, near: float = 0.0
+    see: Callable[[], ArmState],
+    point: Float[np.ndarray, " 3"],
+    finger: float,
+    speed: float,
+    steps: int,
+    near: float = 0.0,
 ) -> Moves:
     """Moves towards a point for at most ``steps`` steps, until the gripper is ``near`` it along each axis."""
     for _ in range(steps):

@@ -46,7 +46,7 @@ class Row:
         return {name: reason for result in self.results for name, reason in result.reasons.items()}
 
 
-class Scored(Protocol):
+class HasSpreads(Protocol):
     """A row with means over seeds."""
 
     @property
@@ -67,7 +67,7 @@ def tabulate(results: Iterable[RunResult], fields: Sequence[str]) -> list[Row]:
     return rows
 
 
-def best(rows: Sequence[Scored], column: Metric) -> set[int]:
+def best(rows: Sequence[HasSpreads], column: Metric) -> set[int]:
     """Returns the rows whose mean, rounded as shown, is the best; an empty set if fewer than two rows have a mean."""
     spreads = {i: row.spreads[column.name] for i, row in enumerate(rows) if column.name in row.spreads}
     means = {i: round(s.mean, column.decimals) for i, s in spreads.items() if not math.isnan(s.mean)}

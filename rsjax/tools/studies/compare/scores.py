@@ -63,7 +63,7 @@ class Entry:
 
 
 @dataclass(frozen=True)
-class Score:
+class EntryScore:
     """An entry's score of a metric.
 
     Attributes:
@@ -158,16 +158,16 @@ def base_of(score: str) -> str:
     return max((name for name in metrics() if f"{score}_".startswith(f"{name}_")), key=len, default="")
 
 
-def score_of(entry: Entry, metric: Metric) -> Score:
+def score_of(entry: Entry, metric: Metric) -> EntryScore:
     """Returns an entry's score of a metric."""
     seeds = entry.seeds(metric)
     clips = entry.per_clip(metric)
     if not seeds:
-        return Score(None, None, entry.reason(metric))
+        return EntryScore(None, None, entry.reason(metric))
     interval = None
     if clips is not None:
         interval = paired_bootstrap(clips, 0 * clips[:1], statistic=metric.statistic)
-    return Score(spread(seeds), interval, "")
+    return EntryScore(spread(seeds), interval, "")
 
 
 def difference(entry: Entry, reference: Entry, metric: Metric) -> Difference | None:

@@ -20,7 +20,7 @@ from rsjax.tools.studies.compare.published import (
 from rsjax.tools.studies.compare.scores import (
     Difference,
     Entry,
-    Score,
+    EntryScore,
     columns,
     depth_suffix,
     difference,
@@ -48,7 +48,7 @@ class Comparison:
     entries: Sequence[Entry]
     metrics: Sequence[Metric]
     reference: Entry
-    scores: dict[str, list[Score]]
+    scores: dict[str, list[EntryScore]]
     differences: dict[str, list[Difference | None]]
     papers: dict[str, dict[str, float]]
     notes: list[str]

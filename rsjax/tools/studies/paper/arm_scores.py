@@ -22,7 +22,7 @@ SEED_DIGITS = 6  # of a seed's
 
 
 @dataclass(frozen=True)
-class Scored:
+class ScoreRows:
     """An arm's scores by one name.
 
     Attributes:
@@ -59,7 +59,7 @@ class ArmScores:
     trainings: tuple[str, ...]
     clips: tuple[str, ...]
     numbers: Mapping[str, Sequence[float | None]]
-    scores: Mapping[str, Mapping[str, Scored]]
+    scores: Mapping[str, Mapping[str, ScoreRows]]
     parameters: str | None = None
     steps: int | None = None
     tflop: float | None = None
@@ -108,7 +108,7 @@ def read_arm(claim: Claim, name: str, plan: Plan, known: Mapping[str, RunResult]
     for metric, source in claim.beside.items():
         measured = [read(result.run, source)[0].get(metric) for result in finished]
         numbers[metric] = [None if each is None else rounded(float(np.mean(each)), SEED_DIGITS) for each in measured]
-    scores: dict[str, dict[str, Scored]] = {}  # of the clips, which the claim's comparisons need
+    scores: dict[str, dict[str, ScoreRows]] = {}  # of the clips, which the claim's comparisons need
     for comparison in claim.comparisons if finished else ():
         for side, score in ((comparison.better, comparison.score), (comparison.than, comparison.than_score)):
             if side == name:
@@ -150,7 +150,7 @@ def merge_arms(one: ArmScores, other: ArmScores) -> ArmScores:
     numbers = {
         name: [arm.numbers[name][row] if name in arm.numbers else None for arm, row in ordered] for name in names
     }
-    scores: dict[str, dict[str, Scored]] = {}
+    scores: dict[str, dict[str, ScoreRows]] = {}
     for source in dict.fromkeys([*one.scores, *other.scores]):
         by_name = [arm.scores.get(source, {}) for arm in (one, other) if arm.seeds]
         scores[source] = {}
@@ -158,9 +158,9 @@ def merge_arms(one: ArmScores, other: ArmScores) -> ArmScores:
             reason = next((each[name].reason for each in by_name if name in each and each[name].reason), "")
             if not reason and all(name in each for each in by_name):
                 rows = tuple(arm.scores[source][name].rows[row] for arm, row in ordered)
-                scores[source][name] = Scored(rows)
+                scores[source][name] = ScoreRows(rows)
             else:
-                scores[source][name] = Scored(reason=reason or f"some seeds have no score named {name}")
+                scores[source][name] = ScoreRows(reason=reason or f"some seeds have no score named {name}")
     minutes = [arm.minutes for arm, _ in ordered if arm.minutes is not None]
     return replace(
         other if other.seeds else one,
@@ -174,16 +174,16 @@ def merge_arms(one: ArmScores, other: ArmScores) -> ArmScores:
     )
 
 
-def _scored(finished: Sequence[RunResult], source: str, score: str, metric: str, read: ReadScores) -> Scored:
+def _scored(finished: Sequence[RunResult], source: str, score: str, metric: str, read: ReadScores) -> ScoreRows:
     """Returns the clips' scores by one name, if all finished seeds have them."""
     rows = []
     for result in finished:
         scores, reason = read(result.run, source)
         if score not in scores:
-            return Scored(reason=reason or result.reasons.get(metric) or f"no score named {score}")
+            return ScoreRows(reason=reason or result.reasons.get(metric) or f"no score named {score}")
         values = np.asarray(scores[score], float)
         rows.append(tuple(rounded(float(value), CLIP_DIGITS) or 0.0 for value in values))
-    return Scored(tuple(rows))
+    return ScoreRows(tuple(rows))
 
 
 def rounded(value: float | None, digits: int) -> float | None:

@@ -63,7 +63,7 @@ class Arm:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class ArmComparison:
     """A part of a claim: one arm scores better than another.
 
     Attributes:
@@ -115,7 +115,7 @@ class Claim:
     statement: str
     place: str
     arms: tuple[Arm, ...]
-    comparisons: tuple[Comparison, ...]
+    comparisons: tuple[ArmComparison, ...]
     shown: tuple[str, ...] = ()
     beside: Mapping[str, str] = field(default_factory=dict)
     rank: int = 5
@@ -147,9 +147,9 @@ class Claim:
 ESTIMATED_DEPTH = tuple(f"depth_{name}_median_estimator" for name in ("absrel", "delta1", "delta2"))
 
 
-def pairs(better: str, than: str, *metrics: str) -> tuple[Comparison, ...]:
+def pairs(better: str, than: str, *metrics: str) -> tuple[ArmComparison, ...]:
     """Returns comparisons of two arms, one for each of these metrics."""
-    return tuple(Comparison(metric, better, than) for metric in metrics)
+    return tuple(ArmComparison(metric, better, than) for metric in metrics)
 
 
 _CLAIMS: dict[str, Claim] = {}

@@ -13,7 +13,7 @@ from rsjax.evaluation.registry import Metric, Unavailable, metrics
 from rsjax.evaluation.statistics import Estimate, Statistic, TTest, Verdict
 from rsjax.tools.pipeline.run import Run
 from rsjax.tools.studies.paper.arm_scores import ArmScores, read_arm
-from rsjax.tools.studies.paper.claim import Claim, Comparison
+from rsjax.tools.studies.paper.claim import ArmComparison, Claim
 from rsjax.tools.studies.paper.measurements import read_scores
 from rsjax.tools.studies.paper.plan import Plan
 from rsjax.tools.studies.results import read_run
@@ -49,7 +49,7 @@ class Judged:
         reason: why there is no difference, or why there is no verdict.
     """
 
-    comparison: Comparison
+    comparison: ArmComparison
     metric: Metric
     seeds: tuple[int, int]
     published: float | None = None
@@ -70,7 +70,7 @@ class Judged:
         return self.comparison.margin if self.metric.better == "higher" else -self.comparison.margin
 
 
-class Pair(NamedTuple):
+class PairedScores(NamedTuple):
     """The scores of two arms for the clips that both have.
 
     Attributes:
@@ -151,7 +151,7 @@ def judge_claim(claim: Claim, arms: Sequence[ArmScores]) -> Outcome:
     return Outcome(claim, tuple(arms), tuple(judged))
 
 
-def _measure(claim: Claim, comparison: Comparison, arms: Mapping[str, ArmScores]) -> Judged:
+def _measure(claim: Claim, comparison: ArmComparison, arms: Mapping[str, ArmScores]) -> Judged:
     """Returns a comparison with its difference, intervals and test, without a verdict."""
     metric = metrics().get(comparison.metric) or Metric(comparison.metric, comparison.metric, "", "higher", 3)
     better = arms[comparison.better]
@@ -201,7 +201,7 @@ def _verdict(judged: Judged) -> Verdict:
     return "cannot tell"
 
 
-def _resampled(pair: Pair, level: float, statistic: Statistic, success: bool) -> Estimate:
+def _resampled(pair: PairedScores, level: float, statistic: Statistic, success: bool) -> Estimate:
     """Returns the difference with its interval over seeds and clips, or, for success rates, Newcombe's."""
     if success:
         return statistics.share_difference(np.concatenate(pair.a), np.concatenate(pair.b), level)
@@ -210,7 +210,7 @@ def _resampled(pair: Pair, level: float, statistic: Statistic, success: bool) ->
     return statistics.paired_bootstrap(np.stack(pair.a), np.stack(pair.b), level=level, statistic=statistic)
 
 
-def _paired(better: ArmScores, than: ArmScores, comparison: Comparison) -> Pair:
+def _paired(better: ArmScores, than: ArmScores, comparison: ArmComparison) -> PairedScores:
     """Returns both arms' scores by seed, for the clips that have a finite score in all seeds of both.
 
     If each seed has clips of its own, a clip needs a score in its seed of both, and seeds of one arm alone are left
@@ -243,14 +243,14 @@ def _paired(better: ArmScores, than: ArmScores, comparison: Comparison) -> Pair:
         kept = [np.isfinite(np.stack([*a, *b])).all(0)] * max(len(a), len(b))
     if not kept or not all(each.any() for each in kept):
         raise Unavailable("no clip has a score in all seeds of both")
-    return Pair(
+    return PairedScores(
         [row[keep] for row, keep in zip(a, kept, strict=False)],
         [row[keep] for row, keep in zip(b, kept, strict=False)],
         own_clips,
     )
 
 
-def _scores(arm: ArmScores, score: str, comparison: Comparison) -> Rows:
+def _scores(arm: ArmScores, score: str, comparison: ArmComparison) -> Rows:
     """Returns an arm's scores by seed.
 
     Raises:

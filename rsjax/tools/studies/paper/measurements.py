@@ -27,7 +27,7 @@ _MEASUREMENTS: dict[str, tuple[Measurement, Seconds]] = {}
 
 
 def measurement(name: str, seconds: Seconds) -> Callable[[Measurement], Measurement]:
-    """Registers a measurement under a name for :attr:`rsjax.tools.studies.paper.claim.Comparison.measurement`.
+    """Registers a measurement under a name for :attr:`rsjax.tools.studies.paper.claim.ArmComparison.measurement`.
 
     Args:
         seconds: a function that estimates its time for a run with a configuration.

@@ -21,7 +21,7 @@ from rsjax.tools.studies.compare.page import ComparedClip
 from rsjax.tools.studies.paper.claim_tables import LEGEND, claim_content, claim_figure, claim_tables, marked
 from rsjax.tools.studies.paper.judge import Outcome
 from rsjax.tools.studies.paper.plan import Plan
-from rsjax.tools.studies.paper.result_files import provenance, write_result
+from rsjax.tools.studies.paper.result_files import provenance, write_claim_result
 from rsjax.tools.studies.report.figures import filmstrip
 from rsjax.tools.studies.report.page import template_environment
 from rsjax.tools.studies.report.video import webp, webp_uri
@@ -69,7 +69,7 @@ def write_report(out: Path, plan: Plan, outcomes: Sequence[Outcome], command: st
         for outcome in outcomes:
             runs = [result.run for arm in outcome.arms for result in arm.finished]
             if runs:
-                write_result(out / RESULTS / f"{outcome.claim.name}.json", outcome, about | provenance(runs))
+                write_claim_result(out / RESULTS / f"{outcome.claim.name}.json", outcome, about | provenance(runs))
         for name, render in (("report.md", as_markdown), ("report.html", as_html)):
             template = environment.get_template(f"{name}.j2")
             text = template.render(

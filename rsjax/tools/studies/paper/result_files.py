@@ -17,8 +17,8 @@ import numpy as np
 from rsjax.files import FileError, read_json, write_file
 from rsjax.tools.pipeline.provenance import read_starts
 from rsjax.tools.pipeline.run import Run
-from rsjax.tools.studies.paper.arm_scores import CLIP_DIGITS, ArmScores, Scored, merge_arms, rounded
-from rsjax.tools.studies.paper.claim import Arm, Claim, Comparison
+from rsjax.tools.studies.paper.arm_scores import CLIP_DIGITS, ArmScores, ScoreRows, merge_arms, rounded
+from rsjax.tools.studies.paper.claim import Arm, ArmComparison, Claim
 from rsjax.tools.studies.paper.judge import Outcome, judge_claim
 
 KIND = "measured"
@@ -26,7 +26,7 @@ MOST_BYTES = 300_000
 OF_CLAIM = ("name", "title", "statement", "place", "notes", "shown", "beside")
 
 
-def write_result(path: Path, outcome: Outcome, about: Mapping[str, Any], most: int = MOST_BYTES) -> None:
+def write_claim_result(path: Path, outcome: Outcome, about: Mapping[str, Any], most: int = MOST_BYTES) -> None:
     """Writes what was measured for a claim.
 
     Args:
@@ -71,7 +71,7 @@ def write_result(path: Path, outcome: Outcome, about: Mapping[str, Any], most: i
     write_file(path, text.encode())
 
 
-def read_result(path: Path) -> Outcome:
+def read_claim_result(path: Path) -> Outcome:
     """Reads a file of results, and judges the claim anew.
 
     Raises:
@@ -84,7 +84,7 @@ def read_result(path: Path) -> Outcome:
             **content["claim"]
             | {
                 "arms": tuple(Arm(arm["name"], equal=arm["equal"], published=arm["published"]) for arm in arms),
-                "comparisons": tuple(Comparison(**each) for each in content["claim"]["comparisons"]),
+                "comparisons": tuple(ArmComparison(**each) for each in content["claim"]["comparisons"]),
                 "notes": tuple(content["claim"]["notes"]),
                 "shown": tuple(content["claim"]["shown"]),
             }
@@ -94,7 +94,7 @@ def read_result(path: Path) -> Outcome:
         raise FileError(f"{path}: damaged or of another version ({error!r}); add it again from its study") from error
 
 
-def merge_result(path: Path, study: Path) -> None:
+def merge_claim_result(path: Path, study: Path) -> None:
     """Adds the trainings of a study's file to a file of results of the same claim.
 
     A study may be divided among machines by its seeds. Where both files have a training with the same seed, the study's
@@ -104,8 +104,8 @@ def merge_result(path: Path, study: Path) -> None:
         FileError: a file is missing or damaged, or the two differ in what they compare, or in the preset or sizes of
             trainings.
     """
-    ours = read_result(path)
-    theirs = read_result(study)
+    ours = read_claim_result(path)
+    theirs = read_claim_result(study)
     before = read_json(path)
     after = read_json(study)
     for what, one, other in (
@@ -123,7 +123,7 @@ def merge_result(path: Path, study: Path) -> None:
     about |= {name: list(dict.fromkeys([*before[name], *after[name]])) for name in ("commits", "machines")}
     days = sorted(day for content in (before, after) for day in content["dates"].split(" to "))
     about["dates"] = " to ".join(dict.fromkeys([days[0], days[-1]]))
-    write_result(path, judge_claim(theirs.claim, arms), about)
+    write_claim_result(path, judge_claim(theirs.claim, arms), about)
 
 
 def about_result(path: Path) -> str:
@@ -134,7 +134,7 @@ def about_result(path: Path) -> str:
     return "; ".join(part for part in parts if part)
 
 
-def content_key(path: Path) -> str:
+def claim_result_key(path: Path) -> str:
     """Returns a hash of a file of results and of the scores beside it."""
     digest = hashlib.sha256(path.read_bytes())
     beside = path.with_suffix(".npz")
@@ -160,7 +160,7 @@ def provenance(runs: Sequence[Run]) -> dict[str, Any]:
 def _arm_scores(content: Mapping[str, Any], beside: Path) -> ArmScores:
     """Returns an arm from its JSON, and from the file beside it."""
     names = {field.name for field in fields(ArmScores)} - {"results"}
-    scores: dict[str, dict[str, Scored]] = {}
+    scores: dict[str, dict[str, ScoreRows]] = {}
     for source, by_name in content["scores"].items():
         scores[source] = {}
         for name, scored in by_name.items():
@@ -170,7 +170,7 @@ def _arm_scores(content: Mapping[str, Any], beside: Path) -> ArmScores:
                     keys = [json.dumps([content["name"], source, name, number]) for number in range(rows)]
                     rows = [[rounded(float(value), CLIP_DIGITS) for value in arrays[key]] for key in keys]
             numbers = tuple(tuple(np.nan if value is None else float(value) for value in row) for row in rows)
-            scores[source][name] = Scored(numbers, scored["reason"])
+            scores[source][name] = ScoreRows(numbers, scored["reason"])
     values = {name: content[name] for name in names} | {"scores": scores}
     return ArmScores(**values | {name: tuple(values[name]) for name in ("seeds", "trainings", "clips")})
 

@@ -5,7 +5,7 @@ from operator import itemgetter
 from typing import NamedTuple
 
 
-class Target(NamedTuple):
+class MetricBound(NamedTuple):
     """A lower (or upper) bound on a quantity computed from metrics."""
 
     name: str
@@ -18,46 +18,48 @@ class Target(NamedTuple):
 class Verdict(NamedTuple):
     """A target and its measurement. A negative ``margin`` is the amount by which the target was missed."""
 
-    target: Target
+    target: MetricBound
     measured: float
     margin: float
 
 
 TARGETS = (
-    Target("prediction above repeating the first frame", lambda m: m["psnr"] - m["psnr_repeat_first"], 5.0),
-    Target("prediction below the tokenizer's reconstruction", lambda m: m["psnr_tokenizer"] - m["psnr"], 3.0, False),
-    Target(
+    MetricBound("prediction above repeating the first frame", lambda m: m["psnr"] - m["psnr_repeat_first"], 5.0),
+    MetricBound(
+        "prediction below the tokenizer's reconstruction", lambda m: m["psnr_tokenizer"] - m["psnr"], 3.0, False
+    ),
+    MetricBound(
         "the same, second half of the predicted frames",
         lambda m: m["psnr_tokenizer_second_half"] - m["psnr_second_half"],
         4.0,
         False,
     ),
-    Target("cube's place in the last frame, median error", itemgetter("cube_error_widths"), 0.3, False, "widths"),
-    Target("gripper's place, likewise", itemgetter("gripper_error_widths"), 0.3, False, "widths"),
-    Target("lifted or not, share read right", itemgetter("lifted_accuracy"), 0.9, unit=""),
-    Target(
+    MetricBound("cube's place in the last frame, median error", itemgetter("cube_error_widths"), 0.3, False, "widths"),
+    MetricBound("gripper's place, likewise", itemgetter("gripper_error_widths"), 0.3, False, "widths"),
+    MetricBound("lifted or not, share read right", itemgetter("lifted_accuracy"), 0.9, unit=""),
+    MetricBound(
         "grasps that fail in the simulator, share that succeed in the model",
         itemgetter("contact_false_success"),
         0.2,
         False,
         "",
     ),
-    Target(
+    MetricBound(
         "gripper's place in frame 48 of a drive, median error",
         itemgetter("drive_gripper_error_widths"),
         0.5,
         False,
         "widths",
     ),
-    Target("ΔPSNR, another clip's actions", itemgetter("delta_psnr"), 7.0),
-    Target(
+    MetricBound("ΔPSNR, another clip's actions", itemgetter("delta_psnr"), 7.0),
+    MetricBound(
         "depth AbsRel, relative to repeating the first frame",
         lambda m: m["depth_absrel"] / m["depth_absrel_repeat_first"],
         0.2,
         False,
         "×",
     ),
-    Target("whole run", lambda m: m["seconds_total"] / 60, 30.0, False, "min"),
+    MetricBound("whole run", lambda m: m["seconds_total"] / 60, 30.0, False, "min"),
 )
 
 

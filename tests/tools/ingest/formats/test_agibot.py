@@ -8,7 +8,7 @@ import h5py
 import numpy as np
 import pytest
 
-from rsjax.tools.ingest.actions import Layout
+from rsjax.tools.ingest.actions import ActionLayout
 from rsjax.tools.ingest.episode import EpisodeError
 from rsjax.tools.ingest.formats import open_source
 from tests.tools.ingest.formats.reading import read_first
@@ -100,7 +100,7 @@ def test_a_whole_episode(tmp_path: Path) -> None:
         (0, 4, "pick up the cup", "Pick"),
         (4, 8, "place the cup", "Place"),
     ]
-    assert Layout.from_json(episode.meta["actions"]) == Layout("absolute", (6, 10), (14, 15))
+    assert ActionLayout.from_json(episode.meta["actions"]) == ActionLayout("absolute", (6, 10), (14, 15))
     assert episode.meta["scene"] == "a table"
     assert not episode.meta["notes"].get("scattered")
     json.dumps(episode.meta)

@@ -9,7 +9,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from rsjax.data.codec import decode, encode
-from rsjax.tools.ingest.actions import ActionConfig, Layout, sampled_actions
+from rsjax.tools.ingest.actions import ActionConfig, ActionLayout, sampled_actions
 from rsjax.tools.ingest.episode import Episode, EpisodeError
 from rsjax.tools.ingest.formats import open_source
 from tests.tools.ingest.formats.reading import error_of, read_all, read_first
@@ -58,7 +58,7 @@ def test_an_episode_in_a_folder(tmp_path: Path) -> None:
     np.testing.assert_allclose(episode.timestamps, np.arange(COUNT) / 10)
     assert [(s.start, s.end, s.text, s.skill) for s in episode.segments] == [(0, 3, "take", "pick"), (3, 8, "put", "")]
     assert episode.meta["action_names"] == ["action_x", "action_grip"]
-    assert Layout.from_json(episode.meta["actions"]) == Layout("absolute", held=(1,))
+    assert ActionLayout.from_json(episode.meta["actions"]) == ActionLayout("absolute", held=(1,))
 
 
 @pytest.mark.parametrize("kind", ["csv", "parquet", "npy", "one row less"])
@@ -120,7 +120,7 @@ def test_links_that_lead_to_themselves(tmp_path: Path) -> None:
 
 
 def sampled(episode: Episode, step: int) -> np.ndarray:
-    layout = Layout.from_json(json.loads(json.dumps(episode.meta["actions"])))
+    layout = ActionLayout.from_json(json.loads(json.dumps(episode.meta["actions"])))
     return sampled_actions(episode.actions, np.arange(0, COUNT, step), ActionConfig(), layout)
 
 

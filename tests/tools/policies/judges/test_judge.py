@@ -16,8 +16,15 @@ from rsjax.tools.policies.judges import judge_training as judging
 from rsjax.tools.policies.judges import trained_judge as judge_module
 from rsjax.tools.policies.judges.judge import HISTORY, LABELS, last_frames
 from rsjax.tools.policies.judges.people_and_vlms import HumanJudge, LanguageJudge, answer_label, write_blinded
-from rsjax.tools.policies.judges.trained_judge import Footage, Network, TrainedJudge, load_judge, spoilt, train_judge
-from rsjax.tools.policies.judges.validation import markdown, scores, summary, table, validate
+from rsjax.tools.policies.judges.trained_judge import (
+    Footage,
+    JudgeNetwork,
+    TrainedJudge,
+    load_judge,
+    spoilt,
+    train_judge,
+)
+from rsjax.tools.policies.judges.validation import confusion_table, markdown, scores, summary, validate
 from tests.tools.pipeline import toy
 
 
@@ -44,7 +51,7 @@ def test_a_judge_tells_success_from_failure_and_from_spoilt_frames(judge: Traine
     assert result["right"][0] > 0.8, result
     assert np.sum(result["confusion"]) == 2 * 20 * 5
     assert all(result[f"{label}_found"][0] > 0.6 for label in LABELS), result
-    assert len(table({"clips": 20, "raw": result}).rows) == 3
+    assert len(confusion_table({"clips": 20, "raw": result}).rows) == 3
     facts = summary({"clips": 20, "raw": result})
     assert facts is not None and facts["raw"]["confusion"] == result["confusion"] and "bins" not in facts["raw"]
     cells = [" / ".join(map(str, row)) for row in result["confusion"]]
@@ -169,7 +176,7 @@ def test_a_runs_judge_is_made_and_saved(tmp_path: Path, monkeypatch: pytest.Monk
         return Video(prompt.rgb.repeat(actions.shape[1], 1))
 
     judge = TrainedJudge(
-        Network().init(jax.random.key(0), np.zeros((1, HISTORY, 64, 64, 3), np.uint8))["params"], 2.0, 64
+        JudgeNetwork().init(jax.random.key(0), np.zeros((1, HISTORY, 64, 64, 3), np.uint8))["params"], 2.0, 64
     )
     run, store = tmp_path / "run", toy.store(tmp_path / "clips")
     model = SimpleNamespace(generate=generate, reconstruct=lambda assets, video: video)

@@ -16,10 +16,10 @@ from rsjax.tools.policies.judges.judge import HISTORY
 from rsjax.tools.policies.planning import closed_loop as planning
 from rsjax.tools.policies.planning import energies
 from rsjax.tools.policies.planning.closed_loop import PlanSettings, compare, folder, results_text
-from rsjax.tools.policies.planning.energies import Seen, imagined, judged, pixel_distance, token_distance
+from rsjax.tools.policies.planning.energies import RecentFrames, imagined, judged, pixel_distance, token_distance
 from rsjax.tools.policies.planning.planner import Planner, PlannerConfig, search
 from rsjax.tools.policies.worlds.simulator_world import SimulatorWorld
-from rsjax.tools.sim.expert import State
+from rsjax.tools.sim.expert import LiftState
 from tests.models.toy_family import ToyConfig
 from tests.tools.pipeline import toy
 from tests.tools.policies.toy_worlds import ToySimulator
@@ -105,7 +105,7 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> TrainedModel:
 
 
 def test_a_planner_acts_in_frames_with_and_without_depth() -> None:
-    asked: list[Seen] = []
+    asked: list[RecentFrames] = []
 
     def plan(seen: Any) -> np.ndarray:
         asked.append(seen)
@@ -128,7 +128,7 @@ def test_energies_are_scores_of_what_a_model_generates() -> None:
     model = TrainedModel(config, create_model(config), {"gain": 0.3}, Assets(Normalization((0.0,), (1.0,), None), None))
     rgb, rng = toy.clip(0).rgb[:2], np.random.default_rng(0)
     candidates = rng.uniform(-0.2, 0.2, (2, 6, 28)).astype(np.float32)
-    seen = Seen(rgb, None, rng.normal(size=(2, 28)).astype(np.float32))
+    seen = RecentFrames(rgb, None, rng.normal(size=(2, 28)).astype(np.float32))
     actions = np.concatenate([np.repeat(seen.actions[None], 2, 0), candidates], 1)
     videos = model.plan(rgb, actions).rgb[:, -HISTORY:]
     goal = videos[1, -1]
@@ -153,7 +153,7 @@ def test_success_is_read_from_the_models_own_head(tmp_path: Path) -> None:
     rgb = toy.clip(0).rgb[:2]
     rows = np.random.default_rng(0).normal(0, 0.4, (2 + 2 * 3, 28)).astype(np.float32)
     candidates = rows[2:].reshape(2, 3, 28)
-    found = energies.success(model)(Seen(rgb, None, rows[:2]), candidates)
+    found = energies.success(model)(RecentFrames(rgb, None, rows[:2]), candidates)
     actions = np.concatenate([np.repeat(rows[None, :2], 2, 0), candidates], 1)
     state = model.plan(rgb, actions).state
     assert state is not None
@@ -209,7 +209,7 @@ def test_the_distance_of_lpips_compares_last_frames_with_the_goal(monkeypatch: p
 class FakeLift(ToySimulator):
     """Stands in for Lift: done once a control's first number is large, as the expert's is far from the cube."""
 
-    state: Any = State(np.zeros(3), np.zeros(3), 0.0, np.array([1.0, 0.0, 0.8]), 0.0)
+    state: Any = LiftState(np.zeros(3), np.zeros(3), 0.0, np.array([1.0, 0.0, 0.8]), 0.0)
 
     def reset(self, seed: int) -> None:
         self.place = 0.0

@@ -18,7 +18,7 @@ from rsjax.models.load_run import load
 from rsjax.tools.policies.config import toy
 from rsjax.tools.policies.judges.judge import HISTORY
 from rsjax.tools.policies.judges.judge_training import FOLDER
-from rsjax.tools.policies.judges.trained_judge import Network, TrainedJudge
+from rsjax.tools.policies.judges.trained_judge import JudgeNetwork, TrainedJudge
 from rsjax.tools.policies.on_policy import FIRST_EPISODE
 from rsjax.tools.policies.policy_training import train_policy
 from rsjax.tools.policies.run_data import RunData
@@ -52,7 +52,7 @@ def done(command: Commands, *words: object) -> str:
 def place(debug: Path, command: Commands, tmp_path_factory: pytest.TempPathFactory) -> Place:
     folder = tmp_path_factory.mktemp("adapt")
     run = shutil.copytree(debug, folder / "run", symlinks=True)
-    params = Network().init(jax.random.key(0), np.zeros((1, HISTORY, 64, 64, 3), np.uint8))["params"]
+    params = JudgeNetwork().init(jax.random.key(0), np.zeros((1, HISTORY, 64, 64, 3), np.uint8))["params"]
     TrainedJudge(params, 1.0, 64).save(run / FOLDER)
     config = toy()
     demos = RunData(run, command.data).demos("all")

@@ -11,8 +11,8 @@ from PIL import Image
 
 from rsjax.tools.studies import result_pages
 from rsjax.tools.studies.paper import result_files
-from rsjax.tools.studies.paper.arm_scores import ArmScores, Scored, rounded
-from rsjax.tools.studies.paper.claim import Comparison
+from rsjax.tools.studies.paper.arm_scores import ArmScores, ScoreRows, rounded
+from rsjax.tools.studies.paper.claim import ArmComparison
 from rsjax.tools.studies.paper.claim_tables import claim_content, claim_tables
 from rsjax.tools.studies.paper.judge import Outcome, judge_claim
 from rsjax.tools.studies.paper.run import run_plan
@@ -43,19 +43,19 @@ def arm(
             difficulty = shared.normal(20, 3, CLIPS) + shared.normal(0, 2)
             row = difficulty + added + rng.normal(0, noise) + rng.normal(0, noise, CLIPS)
             rows.append(tuple(rounded(float(value), 4) or 0.0 for value in row))
-        found[metric] = Scored(tuple(rows))
+        found[metric] = ScoreRows(tuple(rows))
     numbers = {metric: [float(np.mean(row)) for row in scored.rows] for metric, scored in found.items()}
     seeds = tuple(range(len(keys)))
     return ArmScores(name, SEEDS, seeds, tuple(f"{name} {seed}" for seed in seeds), keys, numbers, {"": found})
 
 
-def outcome(*comparisons: Comparison, **arms: ArmScores) -> Outcome:
+def outcome(*comparisons: ArmComparison, **arms: ArmScores) -> Outcome:
     claim = toy.claim("toy", *comparisons)
     return judge_claim(claim, [arms["with_"], arms["without"]])
 
 
 def judged(*metrics: str, equal: float | None = None, **arms: ArmScores) -> list[str]:
-    comparisons = [Comparison(metric, "with", "without", equal=equal) for metric in metrics]
+    comparisons = [ArmComparison(metric, "with", "without", equal=equal) for metric in metrics]
     return [each.verdict for each in outcome(*comparisons, **arms).judged]
 
 
@@ -73,7 +73,7 @@ def judged(*metrics: str, equal: float | None = None, **arms: ArmScores) -> list
 def test_a_planted_difference_is_found(gain: float, noise: float, verdict: str, clips: tuple[str, ...]) -> None:
     """Where each seed has its own clips, seeds differ by 2 dB: only pairs of seeds can tell 0.5 dB."""
     arms = {"with_": arm("with", gain, noise, clips), "without": arm("without", 0, noise, clips)}
-    (found,) = outcome(Comparison("psnr", "with", "without"), **arms).judged
+    (found,) = outcome(ArmComparison("psnr", "with", "without"), **arms).judged
     assert found.verdict == verdict
     assert found.difference is not None and found.resampled is not None and found.test is not None
     low = min(found.resampled.low or 0, found.test.difference.low or 0)
@@ -82,10 +82,10 @@ def test_a_planted_difference_is_found(gain: float, noise: float, verdict: str, 
 
 def test_seeds_of_one_arm_alone_have_no_pair() -> None:
     arms = {"with_": arm("with", 0.5, clips=OWN[:3]), "without": arm("without", clips=OWN[1:])}
-    (found,) = outcome(Comparison("psnr", "with", "without"), **arms).judged
+    (found,) = outcome(ArmComparison("psnr", "with", "without"), **arms).judged
     assert found.verdict == "holds" and found.test is not None and found.test.df == 1
     apart = {"with_": arm("with", 0.5, clips=OWN[:2]), "without": arm("without", clips=OWN[2:])}
-    (found,) = outcome(Comparison("psnr", "with", "without"), **apart).judged
+    (found,) = outcome(ArmComparison("psnr", "with", "without"), **apart).judged
     assert found.difference is None and "no clip has a score" in found.reason
 
 
@@ -97,8 +97,8 @@ def test_a_difference_that_holds_alone_may_not_among_several() -> None:
         "without": arm("without", 0, 0.05, more=dict.fromkeys(names, 0.0)),
     }
     assert judged("psnr", equal=0, **arms) == ["holds"]
-    alone = outcome(Comparison("psnr", "with", "without"), **arms).judged[0]
-    among = outcome(*(Comparison(name, "with", "without", equal=0) for name in ("psnr", *names)), **arms).judged[0]
+    alone = outcome(ArmComparison("psnr", "with", "without"), **arms).judged[0]
+    among = outcome(*(ArmComparison(name, "with", "without", equal=0) for name in ("psnr", *names)), **arms).judged[0]
     assert alone.test == among.test and alone.p is not None and among.p is not None
     assert among.p == pytest.approx(min(1, 20 * alone.p))
     assert among.verdict == "cannot tell"
@@ -106,7 +106,7 @@ def test_a_difference_that_holds_alone_may_not_among_several() -> None:
 
 def test_equal_sides_speak_against_the_claim_that_one_is_better() -> None:
     arms = {"with_": arm("with", 0.5, 0.02, more={"ssim": 0.0}), "without": arm("without", 0, 0.02, more={"ssim": 0.0})}
-    both = [Comparison("psnr", "with", "without"), Comparison("ssim", "with", "without", equal=0.1)]
+    both = [ArmComparison("psnr", "with", "without"), ArmComparison("ssim", "with", "without", equal=0.1)]
     assert outcome(*both, **arms).verdict == "does not hold"
     assert outcome(both[1], **arms).verdict == "equal"
     assert outcome(both[0], **arms).verdict == "holds"
@@ -123,17 +123,17 @@ def test_a_file_gives_the_tables_of_the_scores_that_it_was_written_from(
 ) -> None:
     with_ = arm("with", 0.5, clips=clips, more={"ssim": 0.1})
     odd = ((float("nan"), *with_.scores[""]["ssim"].rows[0][1:]), *with_.scores[""]["ssim"].rows[1:])
-    with_ = replace(with_, steps=430, scores={"": {**with_.scores[""], "ssim": Scored(odd)}})
-    lacking = {"48 frames": {"psnr": Scored(reason="no 48 frames yet")}}
+    with_ = replace(with_, steps=430, scores={"": {**with_.scores[""], "ssim": ScoreRows(odd)}})
+    lacking = {"48 frames": {"psnr": ScoreRows(reason="no 48 frames yet")}}
     without = arm("without", clips=clips, more={"ssim": 0.0})
-    comparisons = [*(Comparison(name, "with", "without") for name in ("psnr", "ssim"))]
-    comparisons.append(Comparison("psnr", "with", "without", measurement="48 frames"))
+    comparisons = [*(ArmComparison(name, "with", "without") for name in ("psnr", "ssim"))]
+    comparisons.append(ArmComparison("psnr", "with", "without", measurement="48 frames"))
     arms = {each.name: replace(each, scores=dict(each.scores) | lacking) for each in (with_, without)}
     found = judge_claim(toy.claim("toy", *comparisons), list(arms.values()))
     path = tmp_path / "toy.json"
-    result_files.write_result(path, found, {"command": "the command"}, most)
+    result_files.write_claim_result(path, found, {"command": "the command"}, most)
     assert path.with_suffix(".npz").exists() == (most == 0)
-    read = result_files.read_result(path)
+    read = result_files.read_claim_result(path)
     assert tables(read) == tables(found)
     assert [each.p for each in read.judged] == [each.p for each in found.judged]
     assert read.judged[1].clips == CLIPS - 1 and read.judged[2].reason == "with: no 48 frames yet"
@@ -141,7 +141,7 @@ def test_a_file_gives_the_tables_of_the_scores_that_it_was_written_from(
 
 def some_seeds(whole: ArmScores, rows: slice) -> ArmScores:
     """An arm with some of its finished seeds."""
-    scores = {name: Scored(scored.rows[rows]) for name, scored in whole.scores[""].items()}
+    scores = {name: ScoreRows(scored.rows[rows]) for name, scored in whole.scores[""].items()}
     numbers = {name: values[rows] for name, values in whole.numbers.items()}
     parts = {name: getattr(whole, name)[rows] for name in ("seeds", "trainings", "clips")}
     return replace(whole, planned=len(parts["seeds"]), numbers=numbers, scores={"": scores}, **parts)
@@ -150,24 +150,24 @@ def some_seeds(whole: ArmScores, rows: slice) -> ArmScores:
 @pytest.mark.parametrize("clips", [(), OWN], ids=["the same clips", "clips of each seed"])
 def test_seeds_of_two_machines_are_judged_as_those_of_one(tmp_path: Path, clips: tuple[str, ...]) -> None:
     arms = [replace(arm(name, gain, clips=clips), steps=430) for name, gain in (("with", 0.5), ("without", 0.0))]
-    claim = toy.claim("toy", Comparison("psnr", "with", "without"))
+    claim = toy.claim("toy", ArmComparison("psnr", "with", "without"))
     sizes = {"command": "the command", "preset": "tiny", "budget": "1 h", "sizes": {"episodes": 9}}
 
     def written(name: str, *, date: str = "2026-01-02", rows: slice = slice(None), **more: Any) -> Path:
         path = tmp_path / f"{name}.json"
         found = judge_claim(claim, [some_seeds(each, rows) for each in arms])
         about = {**sizes, "commits": [name], "machines": ["2 cores"], "dates": date, **more}
-        result_files.write_result(path, found, about)
+        result_files.write_claim_result(path, found, about)
         return path
 
     ours = written("ours", rows=slice(2))
     theirs = written("theirs", rows=slice(1, None), date="2026-01-01 to 2026-01-03")
-    result_files.merge_result(ours, theirs)
-    assert tables(result_files.read_result(ours)) == tables(judge_claim(claim, arms))
+    result_files.merge_claim_result(ours, theirs)
+    assert tables(result_files.read_claim_result(ours)) == tables(judge_claim(claim, arms))
     assert "commit ours, theirs; 2 cores; 2026-01-01 to 2026-01-03" in result_files.about_result(ours)
     nothing_yet = written("nothing", rows=slice(0))
-    result_files.merge_result(nothing_yet, theirs)
-    assert result_files.read_result(nothing_yet).arms[0].seeds == arms[0].seeds[1:]
+    result_files.merge_claim_result(nothing_yet, theirs)
+    assert result_files.read_claim_result(nothing_yet).arms[0].seeds == arms[0].seeds[1:]
     before = ours.read_bytes()
     differing: dict[str, dict[str, Any]] = {
         "sizes of trainings": {"sizes": {"episodes": 10}},
@@ -175,27 +175,27 @@ def test_seeds_of_two_machines_are_judged_as_those_of_one(tmp_path: Path, clips:
     }
     for what, other in differing.items():
         with pytest.raises(result_files.FileError) as error:
-            result_files.merge_result(ours, written("other", **other))
+            result_files.merge_claim_result(ours, written("other", **other))
         assert f"its {what} differ" in str(error.value) and ours.read_bytes() == before
     (tmp_path / "printed.json").write_text('{"kind": "transcribed", "tables": {}}')
     with pytest.raises(result_files.FileError):
-        result_files.merge_result(tmp_path / "printed.json", theirs)
+        result_files.merge_claim_result(tmp_path / "printed.json", theirs)
 
 
 def test_a_damaged_file_is_one_line(tmp_path: Path) -> None:
     path = tmp_path / "toy.json"
     path.write_text('{"arms": [], "claim": {"name": "toy"}}')
     with pytest.raises(result_files.FileError) as error:
-        result_files.read_result(path)
+        result_files.read_claim_result(path)
     assert "damaged or of another version" in str(error.value)
 
 
 def test_a_study_becomes_a_file_a_table_and_a_figure(tmp_path: Path) -> None:
     study = tmp_path / "study"
     (study / "results").mkdir(parents=True)
-    found = outcome(Comparison("psnr", "with", "without"), with_=arm("with", 0.5), without=arm("without"))
+    found = outcome(ArmComparison("psnr", "with", "without"), with_=arm("with", 0.5), without=arm("without"))
     about = result_files.provenance([])
-    result_files.write_result(study / "results" / "toy.json", found, about)
+    result_files.write_claim_result(study / "results" / "toy.json", found, about)
     root = tmp_path / "root"
     folder = root / result_pages.FOLDER
     (root / result_pages.DATA).mkdir(parents=True)
@@ -210,7 +210,7 @@ def test_a_study_becomes_a_file_a_table_and_a_figure(tmp_path: Path) -> None:
     assert "| with − without |" in text and "equal steps of the world model" in text
     with Image.open(folder / "mine.png") as image:
         assert image.width > 200
-    result_files.write_result(
+    result_files.write_claim_result(
         study / "results" / "toy.json", judge_claim(found.claim, [arm("with", 0.4), arm("without")]), about
     )
     result_pages.add_result(root, study, "toy", "mine")
@@ -223,7 +223,7 @@ def test_a_study_becomes_a_file_a_table_and_a_figure(tmp_path: Path) -> None:
 def test_the_report_of_a_study_writes_the_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     toy.stub_stages(monkeypatch, tmp_path)
     run_plan(toy.plan(toy.claim()), tmp_path / "out", tmp_path / "data", "the command")
-    read = result_files.read_result(tmp_path / "out" / "results" / "toy.json")
+    read = result_files.read_claim_result(tmp_path / "out" / "results" / "toy.json")
     assert read.verdict == "holds" and [arm.seeds for arm in read.arms] == [(0, 1, 2)] * 2
     report = (tmp_path / "out" / "report.md").read_text()
     assert all(line in report for line in tables(read)["comparisons"].splitlines())

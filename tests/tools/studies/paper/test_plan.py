@@ -13,7 +13,7 @@ from rsjax.config import Config, ConfigError, presets
 from rsjax.tools.pipeline.run import Run
 from rsjax.tools.studies.paper import budget
 from rsjax.tools.studies.paper.budget import HOUR, parse_duration, scale, step_seconds, training_cost
-from rsjax.tools.studies.paper.claim import Arm, Comparison, chosen, claims
+from rsjax.tools.studies.paper.claim import Arm, ArmComparison, chosen, claims
 from rsjax.tools.studies.paper.claims.baselines import FRAME
 from rsjax.tools.studies.paper.plan import Plan, arm_config, make_plan
 from rsjax.tools.studies.paper.run import print_plan
@@ -277,7 +277,7 @@ def test_an_arm_that_cannot_be_trained_is_absent_with_its_reason(capsys: pytest.
 
 def test_claims_name_their_arms_and_are_chosen_by_name() -> None:
     with pytest.raises(ConfigError, match="compares 'none', which is none of its arms"):
-        toy.claim("toy", Comparison("psnr", "with", "none"))
+        toy.claim("toy", ArmComparison("psnr", "with", "none"))
     with pytest.raises(ConfigError, match=r"--only tabel1: no such claim; did you mean 'table1'\? \(claims: table2"):
         chosen(["tabel1"], claims())
     assert all(budget.SEEDS >= 3 for _ in KNOWN)

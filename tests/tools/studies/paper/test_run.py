@@ -27,7 +27,7 @@ from rsjax.tools.studies.ablation.figure import draw
 from rsjax.tools.studies.paper import claim_tables, measurements
 from rsjax.tools.studies.paper import report as page
 from rsjax.tools.studies.paper.budget import HOUR, Scale
-from rsjax.tools.studies.paper.claim import Comparison
+from rsjax.tools.studies.paper.claim import ArmComparison
 from rsjax.tools.studies.paper.claims import baselines
 from rsjax.tools.studies.paper.judge import judge_all
 from rsjax.tools.studies.paper.measurements import measurement
@@ -126,7 +126,7 @@ def test_an_interruption_leaves_a_whole_report_and_the_next_command_goes_on(
 
 
 def test_what_was_not_measured_says_why(tmp_path: Path) -> None:
-    claim = toy.claim("toy", Comparison("psnr", "with", "without"), Comparison("ssim", "with", "without"))
+    claim = toy.claim("toy", ArmComparison("psnr", "with", "without"), ArmComparison("ssim", "with", "without"))
     (claim_,) = run(toy.plan(claim), tmp_path)["claims"]
     assert claim_["verdict"] == "holds", "of what could be measured"
     assert [each["verdict"] for each in claim_["comparisons"]] == ["holds", "not measured"]
@@ -159,8 +159,8 @@ def test_a_single_score_per_seed_is_judged_by_welchs_interval(tmp_path: Path) ->
         return {"r": [0.97 + 0.01 * run.config.train.seed], "strong": [0.9], "none": [float("nan")]}
 
     same: dict[str, Any] = {"better": "with", "than": "with", "measurement": "correlation"}
-    holds = Comparison("r", score="r", than_score="strong", **same)
-    undefined = Comparison("r", score="none", than_score="strong", **same)
+    holds = ArmComparison("r", score="r", than_score="strong", **same)
+    undefined = ArmComparison("r", score="none", than_score="strong", **same)
     (claim,) = run(toy.plan(toy.claim("toy", holds, undefined)), tmp_path)["claims"]
     measurements._MEASUREMENTS.pop("correlation")
     one, other = claim["comparisons"]
@@ -179,7 +179,7 @@ def test_policies_that_never_succeed_are_not_as_good_as_one_another(
         hits = [float(number < 100 * rate) for number in range(100)]
         return {"many": hits, "real": hits}
 
-    compared = Comparison("success", "with", "with", "many", "real", "trials", margin=-0.1)
+    compared = ArmComparison("success", "with", "with", "many", "real", "trials", margin=-0.1)
     (claim,) = run(toy.plan(toy.claim("toy", compared)), tmp_path)["claims"]
     measurements._MEASUREMENTS.pop("trials")
     (found,) = claim["comparisons"]
@@ -189,7 +189,7 @@ def test_policies_that_never_succeed_are_not_as_good_as_one_another(
 
 
 def test_a_measurement_runs_once_per_run_and_again_where_it_failed(tmp_path: Path, longer: list[str]) -> None:
-    plan = toy.plan(toy.claim("toy", Comparison("psnr", "with", "without", measurement="longer")))
+    plan = toy.plan(toy.claim("toy", ArmComparison("psnr", "with", "without", measurement="longer")))
     (claim,) = run(plan, tmp_path)["claims"]
     assert claim["comparisons"][0]["reason"] == "with: ValueError: once"
     (claim,) = run(plan, tmp_path)["claims"]
@@ -205,7 +205,7 @@ def test_a_measurement_that_a_run_cannot_have_is_tried_once(tmp_path: Path) -> N
         tried.append(run.directory.name)
         raise Unavailable("one task alone")
 
-    plan = toy.plan(toy.claim("toy", Comparison("psnr", "with", "without", measurement="other tasks")))
+    plan = toy.plan(toy.claim("toy", ArmComparison("psnr", "with", "without", measurement="other tasks")))
     for _ in range(2):
         (claim,) = run(plan, tmp_path)["claims"]
     measurements._MEASUREMENTS.pop("other tasks")
@@ -358,7 +358,7 @@ def test_a_clip_is_shown_as_every_arm_predicts_it(tmp_path: Path, monkeypatch: p
     assert (tmp_path / "out" / "figures" / "toy-clip.webp").exists()
     assert "(figures/toy-clip.webp)" in (tmp_path / "out" / "report.md").read_text()
     drawn.clear()
-    run(toy.plan(toy.claim("toy", Comparison("psnr", "with", "without", measurement="longer"))), tmp_path)
+    run(toy.plan(toy.claim("toy", ArmComparison("psnr", "with", "without", measurement="longer"))), tmp_path)
     assert not drawn  # the runs kept other frames than it compares
 
 
@@ -371,7 +371,7 @@ def test_a_figure_has_the_scores_that_the_claim_compares(tmp_path: Path, monkeyp
         return b""
 
     monkeypatch.setattr(claim_tables, "draw", draw)
-    compared = (Comparison(metric, "with", "without") for metric in ("psnr", "physics_iq_spatial", "ssim"))
+    compared = (ArmComparison(metric, "with", "without") for metric in ("psnr", "physics_iq_spatial", "ssim"))
     run(toy.plan(toy.claim("toy", *compared)), tmp_path)
     assert set(drawn) == {"psnr", "physics_iq_spatial"}
 

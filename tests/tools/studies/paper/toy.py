@@ -12,7 +12,7 @@ from rsjax.evaluation.results import Evaluation, save_evaluation
 from rsjax.tools.pipeline import stages
 from rsjax.tools.pipeline.run import Run
 from rsjax.tools.studies.paper import budget, claim_tables
-from rsjax.tools.studies.paper.claim import Arm, Claim, Comparison, pairs
+from rsjax.tools.studies.paper.claim import Arm, ArmComparison, Claim, pairs
 from rsjax.tools.studies.paper.plan import Plan, make_plan
 from tests.tools.studies.ablation import toy
 
@@ -20,7 +20,7 @@ CLIPS = 12
 Score = Callable[[Config], float]
 
 
-def claim(name: str = "toy", *comparisons: Comparison, rank: int = 0) -> Claim:
+def claim(name: str = "toy", *comparisons: ArmComparison, rank: int = 0) -> Claim:
     return Claim(
         name=name,
         title="Keypoints help",

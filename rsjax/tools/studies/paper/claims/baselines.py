@@ -10,7 +10,7 @@ from rsjax.models.load_run import load
 from rsjax.tools.bench.timing import median_seconds
 from rsjax.tools.pipeline.run import Run
 from rsjax.tools.studies.compare.published import LOSSY, published_by_metric
-from rsjax.tools.studies.paper.claim import ESTIMATED_DEPTH, Arm, Claim, Comparison, pairs, register
+from rsjax.tools.studies.paper.claim import ESTIMATED_DEPTH, Arm, ArmComparison, Claim, pairs, register
 from rsjax.tools.studies.paper.measurements import Scores, measurement
 
 _PHYSICS = ("physics_iq_spatial", "physics_iq_spatiotemporal", "physics_iq_weighted", "physics_iq_mse")
@@ -44,7 +44,7 @@ def _arms(equal: Literal["seconds", "flops"] = "seconds") -> tuple[Arm, ...]:
     return tuple(replace(arm, rate=RATES[arm.name], published=published_by_metric(arm.name)) for arm in arms)
 
 
-def _against_all(*metrics: str) -> tuple[Comparison, ...]:
+def _against_all(*metrics: str) -> tuple[ArmComparison, ...]:
     """Compares RoboScape with every other family by these metrics."""
     return tuple(
         comparison

@@ -18,7 +18,7 @@ from rsjax.tools.sim.collect import collect, collection_key
 from rsjax.tools.sim.unseen import collect_unseen, unseen_splits
 from rsjax.tools.studies.compare.published import published_by_metric
 from rsjax.tools.studies.paper import budget
-from rsjax.tools.studies.paper.claim import ESTIMATED_DEPTH, Arm, Claim, Comparison, register
+from rsjax.tools.studies.paper.claim import ESTIMATED_DEPTH, Arm, ArmComparison, Claim, register
 from rsjax.tools.studies.paper.claims.baselines import RATES
 from rsjax.tools.studies.paper.measurements import FOLDER, Scores, measurement
 
@@ -78,14 +78,14 @@ register(
         ),
         comparisons=(
             *(
-                Comparison("psnr", "RoboScape", "RoboScape", f"psnr{part}", f"psnr_repeat_first{part}", "48 frames")
+                ArmComparison("psnr", "RoboScape", "RoboScape", f"psnr{part}", f"psnr_repeat_first{part}", "48 frames")
                 for part in ("", "_second_half")
             ),
             *(
-                Comparison(f"{name}", "RoboScape", "RoboScape", name, f"{name}_repeat_first", "48 frames")
+                ArmComparison(f"{name}", "RoboScape", "RoboScape", name, f"{name}_repeat_first", "48 frames")
                 for name in ("cube_error_widths", "gripper_error_widths")
             ),
-            Comparison("psnr", "RoboScape", "Genie", "psnr_second_half", "psnr_second_half", "48 frames"),
+            ArmComparison("psnr", "RoboScape", "Genie", "psnr_second_half", "psnr_second_half", "48 frames"),
         ),
         rank=2,
         notes=(
@@ -113,7 +113,7 @@ register(
             )
         ),
         comparisons=tuple(
-            Comparison(metric, "RoboScape", other, measurement=name)
+            ArmComparison(metric, "RoboScape", other, measurement=name)
             for other in ("Genie", "IRASim", "CogVideoX")
             for name in _PLACES.values()
             for metric in ("psnr", *ESTIMATED_DEPTH, "delta_psnr", "psnr_motion")

@@ -27,7 +27,7 @@ from rsjax.tools.policies.studies.synthesis import CLIPS, Synthesis, synthesize
 from rsjax.tools.policies.studies.trials import Trials, open_lift
 from rsjax.tools.policies.worlds.actions import action_range
 from rsjax.tools.studies.paper.budget import FAMILY_EPISODES, FAMILY_VIDEOS, VIDEO
-from rsjax.tools.studies.paper.claim import Arm, Claim, Comparison, register
+from rsjax.tools.studies.paper.claim import Arm, ArmComparison, Claim, register
 from rsjax.tools.studies.paper.claims.baselines import RATES
 from rsjax.tools.studies.paper.measurements import FOLDER, Scores, measurement
 
@@ -230,10 +230,10 @@ register(
         place="§3.3, Table 3",
         arms=(_OURS,),
         comparisons=(
-            Comparison("success", "RoboScape", "RoboScape", "many", "real", "policies learned", margin=-0.1),
-            Comparison("success", "RoboScape", "RoboScape", "few", "real_few", "policies learned", margin=-0.1),
-            Comparison("success", "RoboScape", "RoboScape", "many", "few", "policies learned"),
-            Comparison("success", "RoboScape", "RoboScape", "both", "repeated", "policies learned"),
+            ArmComparison("success", "RoboScape", "RoboScape", "many", "real", "policies learned", margin=-0.1),
+            ArmComparison("success", "RoboScape", "RoboScape", "few", "real_few", "policies learned", margin=-0.1),
+            ArmComparison("success", "RoboScape", "RoboScape", "many", "few", "policies learned"),
+            ArmComparison("success", "RoboScape", "RoboScape", "both", "repeated", "policies learned"),
         ),
         rank=6,
         notes=(
@@ -254,7 +254,7 @@ register(
         place="authors' answers, reviewer isFR, second question",
         arms=(_OURS, *_OTHERS),
         comparisons=tuple(
-            Comparison("success", "RoboScape", arm.name, score, score, "policies from synthetic video")
+            ArmComparison("success", "RoboScape", arm.name, score, score, "policies from synthetic video")
             for arm in _OTHERS
             for score in ("both", "many")
         ),
@@ -279,9 +279,9 @@ register(
         place="§3.4, Fig. 5",
         arms=(_OURS, *_OTHERS),
         comparisons=(
-            Comparison("correlation", "RoboScape", "RoboScape", "pearson", "strong", "policies judged"),
+            ArmComparison("correlation", "RoboScape", "RoboScape", "pearson", "strong", "policies judged"),
             *(
-                Comparison(metric, "RoboScape", arm.name, score, score, "policies judged")
+                ArmComparison(metric, "RoboScape", arm.name, score, score, "policies judged")
                 for arm in _OTHERS
                 for metric, score in (("correlation", "pearson"), ("same_outcome", "same_outcome"))
             ),
@@ -302,8 +302,8 @@ register(
         place="a use of the model beyond the paper",
         arms=(_OURS,),
         comparisons=(
-            Comparison("success", "RoboScape", "RoboScape", "after", "before", "policies improved"),
-            Comparison("success", "RoboScape", "RoboScape", "after", "control", "policies improved"),
+            ArmComparison("success", "RoboScape", "RoboScape", "after", "before", "policies improved"),
+            ArmComparison("success", "RoboScape", "RoboScape", "after", "control", "policies improved"),
         ),
         rank=6,
         notes=(_NOTE, "The control trains for as many steps on its old demonstrations alone."),
@@ -320,7 +320,8 @@ register(
         place="authors' answers, on planning",
         arms=(_OURS,),
         comparisons=tuple(
-            Comparison("success", "RoboScape", "RoboScape", method, "random", "planned") for method in ("cem", "mppi")
+            ArmComparison("success", "RoboScape", "RoboScape", method, "random", "planned")
+            for method in ("cem", "mppi")
         ),
         rank=6,
         notes=("CEM and MPPI with the judge's success as the goal, against random actions.",),

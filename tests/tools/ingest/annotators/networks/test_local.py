@@ -9,7 +9,7 @@ import pytest
 
 from rsjax.tools.ingest.annotators.depth import DepthAnything, VideoDepthAnything
 from rsjax.tools.ingest.annotators.motion import RaftFlow
-from rsjax.tools.ingest.annotators.network import Network, checkout_module, library, load_weights, on_device
+from rsjax.tools.ingest.annotators.network import NetworkAnnotator, checkout_module, library, load_weights, on_device
 from rsjax.tools.ingest.annotators.protocols import AnnotationError
 from rsjax.tools.ingest.annotators.semantics import InternVL
 from rsjax.tools.ingest.annotators.shots import TransNetShots
@@ -90,7 +90,7 @@ def test_weights_are_checked(tmp_path):
 
 
 @dataclass(frozen=True)
-class Reader(Network):
+class Reader(NetworkAnnotator):
     name = "reader"
     title = "Reader"
     weights: Path
