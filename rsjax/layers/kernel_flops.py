@@ -4,7 +4,7 @@ All products of a kernel count, as the hardware does them: those that a gradient
 hides, and the lanes of zeros that stand for other heads on a TPU.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from math import prod
 
 Shapes = Sequence[tuple[int, ...]]
@@ -47,17 +47,39 @@ def products(rows: tuple[int, ...], kernel: tuple[int, ...], count: int) -> int:
     return count * 2 * rows[0] * prod(kernel)
 
 
-# By pallas_call's ``name``: a function of the shapes of operands and results that returns the operations of one call,
-# 2 per multiply-add.
-KERNEL_FLOPS: dict[str, Callable[[Shapes, Shapes], int]] = {
-    "attend_cells_forward": lambda operands, results: attention(operands[0], results[1], 1, 1),
-    "attend_cells_backward": lambda operands, results: attention(operands[0], operands[3], 2, 3),
-    "attend_frames_forward": lambda operands, results: attention(operands[0], results[1], 1, 1),
-    "attend_frames_backward": lambda operands, results: attention(operands[0], operands[3], 2, 3),
-    "attend_cache": lambda operands, results: over_cache(operands[0], operands[1]),
-    "norm_linear": lambda operands, results: products(operands[0], operands[1], 1),
-    "mlp_forward": lambda operands, results: products(operands[0], operands[1], 2),
-    "mlp_backward": lambda operands, results: products(operands[0], operands[2], 3),
-    "feed_forward_forward": lambda operands, results: products(operands[0], operands[1], 1),
-    "feed_forward_backward": lambda operands, results: products(operands[0], operands[2], 2),
+# The kernels of attention in tiles, by pallas_call's ``name``: products of all lanes, and of one head's.
+ATTENTION = {
+    "attend_cells_forward": (1, 1),
+    "attend_cells_backward": (2, 3),
+    "attend_frames_forward": (1, 1),
+    "attend_frames_backward": (2, 3),
 }
+# The kernels that multiply rows, their first operand, likewise: which operand has the shape of the weights, and how
+# many products there are.
+PRODUCTS = {
+    "norm_linear": (1, 1),
+    "mlp_forward": (1, 2),
+    "mlp_backward": (2, 3),
+    "feed_forward_forward": (1, 1),
+    "feed_forward_backward": (2, 2),
+}
+KERNELS = (*ATTENTION, "attend_cache", *PRODUCTS)
+
+
+def kernel_flops(name: str, operands: Shapes, results: Shapes) -> int:
+    """Returns the operations of one call of a kernel, 2 per multiply-add.
+
+    Args:
+        name: one of :data:`KERNELS`.
+        operands: their shapes.
+        results: their shapes.
+    """
+    if name == "attend_cache":
+        return over_cache(operands[0], operands[1])
+    if name in PRODUCTS:
+        weights, count = PRODUCTS[name]
+        return products(operands[0], operands[weights], count)
+    log_sum = results[1]
+    if name.endswith("backward"):
+        log_sum = operands[3]
+    return attention(operands[0], log_sum, *ATTENTION[name])

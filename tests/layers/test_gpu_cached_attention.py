@@ -10,7 +10,7 @@ import pytest
 
 from rsjax.layers.attention import KeyValues, attend_cached
 from rsjax.layers.gpu.cached_attention import attend, fits
-from rsjax.layers.kernel_flops import KERNEL_FLOPS
+from rsjax.layers.kernel_flops import kernel_flops
 from rsjax.layers.platform import attend_over_cache, for_all_platforms
 
 SHAPE = (2, 2, 8, 3, 2, 32)
@@ -85,5 +85,5 @@ def test_programs_for_gpus_alone_have_the_kernel_and_for_a_bf16_cache_alone(dtyp
 
 
 def test_operations_count_the_new_frames_up_to_a_query_s_own() -> None:
-    count = KERNEL_FLOPS["attend_cache"]([SHAPE, (2, 8, 2, SLOTS, 32)], [])
+    count = kernel_flops("attend_cache", [SHAPE, (2, 8, 2, SLOTS, 32)], [])
     assert count == 2 * 2 * (2 * 8 * 2) * (SLOTS + 1 + SLOTS + 2) * 32

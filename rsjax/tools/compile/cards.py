@@ -34,7 +34,6 @@ class Card:
         link: bytes a second to other cards of its host, or of the TPU's slice, in one direction.
         network: bytes a second to other hosts; the same as ``link`` in a slice of TPUs.
         source: where the figures come from.
-        capability: of a GPU, such as (9, 0).
         description: of a GPU, for XLA; XLA knows TPUs.
     """
 
@@ -48,7 +47,6 @@ class Card:
     link: float
     network: float
     source: str
-    capability: tuple[int, int] = (0, 0)
     description: str = ""
 
 
@@ -68,7 +66,6 @@ CARDS = {
         link=450e9,
         network=50e9,
         source=f"{NVIDIA}/en-us-gpu-resources/h100-datasheet-24306; {XLA}/h100_sxm.txtpb",
-        capability=(9, 0),
         description=_GPU.format(
             9, 0, 132, 2048, 128, 1.98, 233472, 232448, 52428800, 3352320000000, 84978434048, "NVIDIA H100 80GB HBM3"
         ),
@@ -84,7 +81,6 @@ CARDS = {
         link=300e9,
         network=25e9,
         source=f"{NVIDIA}/en-us-genomics-ep/ampere-architecture-white-paper; {XLA}/a100_sxm_80.txtpb",
-        capability=(8, 0),
         description=_GPU.format(
             8, 0, 108, 2048, 64, 1.41, 167936, 166912, 41943040, 2039040000000, 85100068864, "NVIDIA A100-SXM4-80GB"
         ),
@@ -100,7 +96,6 @@ CARDS = {
         link=32e9,
         network=3.1e9,
         source="https://images.nvidia.com/aem-dam/Solutions/geforce/ada/nvidia-ada-gpu-architecture.pdf, appendix A",
-        capability=(8, 9),
         description=_GPU.format(
             8, 9, 128, 1536, 128, 2.52, 102400, 101376, 75497472, 1008096000000, 25386352640, "NVIDIA GeForce RTX 4090"
         ),

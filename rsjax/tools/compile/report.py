@@ -21,7 +21,7 @@ from rsjax.layers.platform import for_all_platforms
 from rsjax.progress import duration
 from rsjax.tools.compile.programs import Program
 from rsjax.tools.compile.roofline import Roofline, part_of, roofline
-from rsjax.tools.compile.targets import Target, answers_for
+from rsjax.tools.compile.targets import Target
 
 LAUNCH_SECONDS = 3e-6  # of a kernel on a GPU; 2 to 5 µs
 GPU_SHARE = 0.92  # of a GPU's memory that XLA can use; the rest is the driver's and the libraries'
@@ -62,7 +62,6 @@ def compile_program(program: Program, target: Target, console: Console) -> Compi
     began = time.monotonic()
     with (
         _shown(f"compiling for {target.title}: {program.title}", console),
-        answers_for(target.card),
         for_all_platforms(),
         tempfile.TemporaryDirectory() as folder,
     ):

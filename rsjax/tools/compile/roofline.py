@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rsjax.layers.kernel_flops import KERNEL_FLOPS
+from rsjax.layers.kernel_flops import KERNELS, kernel_flops
 from rsjax.tools.compile.cards import Card
 from rsjax.tools.compile.hlo import HOST, Array, Computation, Instruction, Module, parse
 
@@ -428,10 +428,10 @@ class _Counter:
             return self._work(flops, operands[0].dtype)
         if target in PLAIN_CALLS:
             return ProductCost()
-        kernels = [name for name in KERNEL_FLOPS if re.search(rf"\b{re.escape(name)}\b", one.op_name)]
+        kernels = [name for name in KERNELS if re.search(rf"\b{re.escape(name)}\b", one.op_name)]
         if kernels:
-            count = KERNEL_FLOPS[max(kernels, key=len)]
-            return self._work(count([x.dims for x in operands], [x.dims for x in one.arrays]), operands[0].dtype)
+            shapes = ([x.dims for x in operands], [x.dims for x in one.arrays])
+            return self._work(kernel_flops(max(kernels, key=len), *shapes), operands[0].dtype)
         self.warnings.append(
             f"{one.name}: the operations of the custom call {target} ({one.op_name}) are not known and not counted; "
             "for a kernel of Pallas, register them in rsjax/layers/kernel_flops.py"

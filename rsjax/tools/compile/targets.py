@@ -1,8 +1,6 @@
 """Clusters of accelerators, named as users name them: ``h100x8``, ``v5e-16``."""
 
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,7 +9,6 @@ from rsjax.errors import did_you_mean
 from rsjax.tools.compile.cards import CARDS, Card
 
 GPUS_PER_HOST = 8
-CUDNN = 91000  # 9.10
 
 # Shapes of the slices that can be rented, by the number in their name: of chips (v5e, v6e), or of cores, two of which
 # are in each chip (v4, v5p).
@@ -139,26 +136,3 @@ def devices(target: Target) -> list[Any]:
     family = target.name.partition("-")[0]
     description = topologies.get_topology_desc(platform="tpu", topology_name=f"{family}:{target.shape}", **settings)
     return list(description.devices)
-
-
-@contextmanager
-def answers_for(card: Card) -> Iterator[None]:
-    """Lets jax ask an absent GPU for its capability and its cuDNN, which it does when it traces cuDNN's attention."""
-    from jax._src.cudnn import fused_attention_stablehlo as cudnn
-
-    def version(text: str) -> tuple[int, ...]:
-        return tuple(map(int, text.split(".")))
-
-    answers = {
-        "check_cudnn_version": lambda: CUDNN,
-        "check_compute_capability": lambda capability: card.capability >= version(capability),
-        "is_cuda_compute_capability_equal": lambda capability: card.capability == version(capability),
-    }
-    kept = {name: getattr(cudnn, name) for name in answers}
-    for name, answer in answers.items():
-        setattr(cudnn, name, answer)
-    try:
-        yield
-    finally:
-        for name, function in kept.items():
-            setattr(cudnn, name, function)

@@ -71,6 +71,11 @@ def noisy(frames: UInt8[np.ndarray, "T H W 3"]) -> UInt8[np.ndarray, "T H W 3"]:
     return np.clip(frames + noise, 0, 255).astype(np.uint8)
 
 
+def unchanged(frames: UInt8[np.ndarray, "T H W 3"]) -> UInt8[np.ndarray, "T H W 3"]:
+    """Returns the frames as they are."""
+    return frames
+
+
 def halved(frames: UInt8[np.ndarray, "T H W 3"]) -> UInt8[np.ndarray, "T H W 3"]:
     """Returns frames of half the side, each pixel the mean of four."""
     size = (frames.shape[2] // 2, frames.shape[1] // 2)
@@ -85,7 +90,7 @@ def sharpened(frames: UInt8[np.ndarray, "T H W 3"]) -> UInt8[np.ndarray, "T H W 
 
 AS_IT_IS = "as it is"
 TREATMENTS: dict[str, Treatment] = {
-    AS_IT_IS: lambda frames: frames,
+    AS_IT_IS: unchanged,
     "MP4, CRF 18": h264(18),
     "MP4, CRF 28": h264(28),
     "MP4, CRF 35": h264(35),
