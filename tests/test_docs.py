@@ -17,6 +17,7 @@ USER_PAGES = sorted((ROOT / "docs").rglob("*.md"))
 LONGEST = 200  # lines of a page for users
 SHORTER = {"performance.md": 150}
 FOLDER_README = 15  # lines of a folder's README
+CODE = (".py", ".js")
 
 
 def anchors(page: Path) -> set[str]:
@@ -28,7 +29,7 @@ def anchors(page: Path) -> set[str]:
 
 def folder_readmes() -> list[Path]:
     """Returns the pages of all folders but the cards of models."""
-    folders = ("rsjax", "examples", "experiments", "benchmarks", "notebooks", "scripts")
+    folders = ("rsjax", "examples", "experiments", "benchmarks", "launch", "notebooks", "scripts", "tests")
     paths = [path for folder in folders for path in sorted((ROOT / folder).rglob("README.md"))]
     return [path for path in paths if path.parents[1].name != "pretrained"]
 
@@ -86,6 +87,11 @@ def test_the_index_names_every_page() -> None:
 @pytest.mark.parametrize("readme", folder_readmes(), ids=name_of)
 def test_readmes_of_folders_are_short(readme: Path) -> None:
     assert len(readme.read_text().splitlines()) <= FOLDER_README
+
+
+def test_every_folder_of_code_has_a_readme() -> None:
+    files = [path for folder in ("rsjax", "benchmarks") for path in (ROOT / folder).rglob("*") if path.suffix in CODE]
+    assert not sorted({name_of(path.parent) for path in files if not (path.parent / "README.md").exists()})
 
 
 def pages_of(navigation: Any) -> list[str]:
