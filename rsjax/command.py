@@ -28,14 +28,14 @@ def refuse_repeated(argv: Sequence[str], repeatable: Collection[str] = ()) -> No
     Raises:
         UserError: an option is repeated.
     """
-    given: set[str] = set()
+    names: set[str] = set()
     for word in argv:
         if not re.match(r"--\w", word):
             continue
         name = re.sub(r"(^|\.)no-", r"\1", word[2:].partition("=")[0].replace("_", "-"))
-        if name in given and name not in repeatable:
+        if name in names and name not in repeatable:
             raise UserError(f"--{name} is given twice; give it once, with all its values")
-        given.add(name)
+        names.add(name)
 
 
 @contextlib.contextmanager

@@ -171,15 +171,15 @@ def digests(directory: Path, names: Iterable[str]) -> dict[str, str]:
     Raises:
         ModelFileError: a file cannot be read.
     """
-    found = {}
+    by_name = {}
     for name in names:
         path = directory / name
         try:
             with regular(path).open("rb") as file:
-                found[name] = hashlib.file_digest(file, "sha256").hexdigest()
+                by_name[name] = hashlib.file_digest(file, "sha256").hexdigest()
         except OSError as error:
             raise ModelFileError(f"{path}: cannot be read ({error.strerror}); {AGAIN}") from error
-    return found
+    return by_name
 
 
 def check_digests(directory: Path) -> None:

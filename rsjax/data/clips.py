@@ -132,10 +132,10 @@ def load_clips(store: Store, count: int, split: str = "test") -> Clips:
         StoreError: no clip can be read.
     """
     source = store.source(split)
-    found = list(readable(source, spread(source, count)))
-    if not found:
+    records = list(readable(source, spread(source, count)))
+    if not records:
         raise StoreError(f"{store.path}: its {split} split has no readable clip; delete it and make it again")
-    return Clips.stacked([clip for _, clip in found], [number for number, _ in found])
+    return Clips.stacked([clip for _, clip in records], [number for number, _ in records])
 
 
 def frame_rate(clip: Record, manifest: Mapping[str, Any]) -> float | None:

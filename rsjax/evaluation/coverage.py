@@ -109,25 +109,25 @@ def nearest(
     """
     squares = np.square(bank, dtype=np.float64).sum(1)
     count = min(NEAREST, len(bank))
-    found = []
+    means = []
     for start in range(0, len(rows), ROWS):
         part = rows[start : start + ROWS].astype(np.float64)
         distances = np.square(part).sum(1)[:, None] - 2 * part @ bank.T.astype(np.float64) + squares
         if without is not None:
             distances[without[start : start + ROWS]] = np.inf
         least = np.partition(distances, count - 1, axis=1)[:, :count]
-        found.append(np.sqrt(np.maximum(least, 0)).mean(1))
-    return np.concatenate(found)
+        means.append(np.sqrt(np.maximum(least, 0)).mean(1))
+    return np.concatenate(means)
 
 
 def features_of(
     trained: TrainedModel, video: Video, actions: Float[np.ndarray, "B T A"], prompt_frames: int
 ) -> Float[np.ndarray, "B P C"] | None:
     """Returns f of every frame after the prompt; None for a family that returns no features."""
-    found = teacher_forced(trained, prompt_frames, video, actions)
-    if found is None:
+    scores = teacher_forced(trained, prompt_frames, video, actions)
+    if scores is None:
         return None
-    return found.features
+    return scores.features
 
 
 def clip_distances(
@@ -162,11 +162,11 @@ def make_coverage(trained: TrainedModel, store: Store, run: Path, clips: int = C
         if not work.finished:
             source = store.source("train")
             records = [record for _, record in readable(source, spread(source, clips))]
-            found = Clips.stacked(records, range(len(records)))
+            batch = Clips.stacked(records, range(len(records)))
             first = trained.config.prompt_frames
-            features = features_of(trained, found.video, found.actions, first)
+            features = features_of(trained, batch.video, batch.actions, first)
             if features is not None and len(records) > 1:
-                made = Coverage.of(features, found.actions[:, first:])
+                made = Coverage.of(features, batch.actions[:, first:])
                 write_file(folder / FILE, encode({field.name: getattr(made, field.name) for field in fields(made)}))
     return read_coverage(trained, store, run, clips)
 

@@ -69,8 +69,8 @@ class LocaliserNetwork(nn.Module):
         xy = jnp.einsum("bno,bnoc->boc", jnp.exp(log_p), at)
         features = jnp.concatenate([fine, _enlarged(middle, fine)], -1).reshape(b, h * w, -1)
         around = jnp.einsum("bno,bnc->boc", jnp.exp(log_p), features)  # features at the objects
-        seen = jnp.concatenate([around.reshape(b, -1), xy.reshape(b, -1)], -1)
-        return xy, nn.Dense(1)(nn.relu(nn.Dense(32)(seen)))[:, 0], log_p
+        at_objects = jnp.concatenate([around.reshape(b, -1), xy.reshape(b, -1)], -1)
+        return xy, nn.Dense(1)(nn.relu(nn.Dense(32)(at_objects)))[:, 0], log_p
 
 
 def _layer(x: Array) -> Array:

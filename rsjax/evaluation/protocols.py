@@ -175,12 +175,12 @@ def find(name: str, config: Config) -> Protocol:
     if name not in PROTOCOLS:
         known = (*PROTOCOLS, OWN)
         raise UserError(f"unknown protocol {name!r}{did_you_mean(name, known)} (protocols: {', '.join(known)})")
-    found = PROTOCOLS[name]
+    protocol = PROTOCOLS[name]
     settings = config.eval
-    if found.samples > 1:
-        return found
-    repetitions = max(found.repetitions, settings.repetitions)
-    return replace(found, clips=max(found.clips, settings.clips), repetitions=repetitions)
+    if protocol.samples > 1:
+        return protocol
+    repetitions = max(protocol.repetitions, settings.repetitions)
+    return replace(protocol, clips=max(protocol.clips, settings.clips), repetitions=repetitions)
 
 
 def label(protocol: Protocol, standard: Protocol) -> str:

@@ -93,9 +93,9 @@ def attend_cached(
         window: the number of frames that a query sees, its own included.
     """
     positions = start + jnp.arange(qkv.shape[1])
-    held = frames_held(cache.k.shape[-2], start - 1)
+    frame_of_slot = frames_held(cache.k.shape[-2], start - 1)
     q, k, v = (x.transpose(0, 2, 3, 1, 4) for x in unpacked(qkv))  # B S h T e
-    parts = [(cache, sees(positions, held, window)), (KeyValues(k, v), sees(positions, positions, window))]
+    parts = [(cache, sees(positions, frame_of_slot, window)), (KeyValues(k, v), sees(positions, positions, window))]
     return attend_few(q, parts).transpose(0, 3, 1, 2, 4).astype(qkv.dtype)
 
 

@@ -36,11 +36,11 @@ def ghost_frames(scene: Scene) -> PerFrame:
     way = scene.truth.rgb[:, last + 1 :] - start
     gone = scene.prediction.rgb[:, last + 1 :] - start
     length = np.square(way).sum(-1)
-    seen = length >= CONTRAST**2
-    share = (gone * way).sum(-1) / np.where(seen, length, 1)
+    visible = length >= CONTRAST**2
+    share = (gone * way).sum(-1) / np.where(visible, length, 1)
     aside = np.square(gone - share[..., None] * way).sum(-1)
-    mixed = seen & (share > MIXED[0]) & (share < MIXED[1]) & (aside < ASIDE**2 * length)
-    return mixed.sum((2, 3)) / np.maximum(seen.sum((2, 3)), 1)
+    mixed = visible & (share > MIXED[0]) & (share < MIXED[1]) & (aside < ASIDE**2 * length)
+    return mixed.sum((2, 3)) / np.maximum(visible.sum((2, 3)), 1)
 
 
 @metric("ghost", "ghosts", better="lower", decimals=3, column=False, per_frame=ghost_frames)
@@ -55,10 +55,10 @@ def morphing(scene: Scene) -> PerClip:
     last = scene.prompt_frames - 1
     scores = []
     for truth, prediction in zip(scene.truth.rgb[:, last:], scene.prediction.rgb[:, last:], strict=True):
-        found = moving_points(truth)
-        found = found[likeness(truth, found) >= ALIKE]
-        changed = likeness(prediction, found) < CHANGED
-        scores.append(float(changed.mean()) if len(found) else 0.0)
+        points = moving_points(truth)
+        points = points[likeness(truth, points) >= ALIKE]
+        changed = likeness(prediction, points) < CHANGED
+        scores.append(float(changed.mean()) if len(points) else 0.0)
     return np.array(scores)
 
 

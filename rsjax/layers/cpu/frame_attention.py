@@ -96,11 +96,11 @@ def _frame_gradient(
     values = []
     cells = q.shape[1]
     for rows in _blocks(causal, cells):
-        seen = k[:, : rows.stop]
-        weights = _rounded(jnp.exp(_scores(q[:, rows], seen, causal) - log_total[:, rows]))
+        visible_keys = k[:, : rows.stop]
+        weights = _rounded(jnp.exp(_scores(q[:, rows], visible_keys, causal) - log_total[:, rows]))
         of_weights = _product("hqe,hke->hqk", g[:, rows], v[:, : rows.stop])
         of_scores = _rounded(weights * (of_weights - along[:, rows]))
-        queries.append(_product("hqk,hke->hqe", of_scores, seen))
+        queries.append(_product("hqk,hke->hqe", of_scores, visible_keys))
         later = ((0, 0), (0, 0), (0, cells - rows.stop))  # keys that these rows do not see
         keys.append(jnp.pad(_product("heq,hqk->hek", _turned(q[:, rows]), of_scores), later))
         values.append(jnp.pad(_product("heq,hqk->hek", _turned(g[:, rows]), weights), later))

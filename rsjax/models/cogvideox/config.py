@@ -153,10 +153,10 @@ class CogVideoXConfig(ModelConfig):
             f"{'channels of a head' if rotary else 'width'} by 16 for positions",
         )
         for name, count in (("stretch", 2), ("learned_positions", 3)):
-            given = getattr(self, name)
+            setting = getattr(self, name)
             require(
-                not given or (len(given) == count and min(given) > 0),
-                f"model.{name} is {given}; it has {count} numbers above 0, or none",
+                not setting or (len(setting) == count and min(setting) > 0),
+                f"model.{name} is {setting}; it has {count} numbers above 0, or none",
             )
         self.sample.check(self.noise)
         require(

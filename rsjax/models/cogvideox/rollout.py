@@ -43,8 +43,8 @@ def rollout(
     empty = empty_texts(text, count)
     for number in range(-(-(frames - prompt.rgb.shape[1]) // (clip_frames - 1))):
         key = jax.random.fold_in(jax.random.key(arch.model.sample.seed), number)
-        given = codec.images(image)["mean"][:, 0]
-        latents = np.asarray(_chunk(arch, params, key, *divide((given, texts, empty, index), params)))
+        first_latent = codec.images(image)["mean"][:, 0]
+        latents = np.asarray(_chunk(arch, params, key, *divide((first_latent, texts, empty, index), params)))
         made.append(codec.decode({"mean": latents}).rgb[:, 1:clip_frames])
         image = made[-1][:, -1]
     return np.concatenate(made, axis=1)[:, :frames]

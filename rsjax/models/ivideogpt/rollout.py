@@ -44,17 +44,17 @@ def generate(
     frames = np.concatenate([np.repeat(prompt[:, :1], lacking, axis=1), prompt], axis=1)
     rows = np.concatenate([np.repeat(actions[:, :1], lacking, axis=1), actions], axis=1)
     count = min(rows.shape[1], layout.most_frames)  # frames of a sequence
-    given = layout.context
+    encoded_frames = layout.context
     if frames.shape[1] < count:
-        given = frames.shape[1]
-    begin = frames.shape[1] - given
+        encoded_frames = frames.shape[1]
+    begin = frames.shape[1] - encoded_frames
     made = []
     # The first sequence is decoded as a whole and usually has all frames of the prompt.
     if begin or frames.shape[1] == rows.shape[1]:
         made.append(codec.decode(codec.encode(Video(frames))).rgb)
     window = frames[:, begin:]
     keys = folded(jnp.broadcast_to(jax.random.key(arch.config.sample.seed), index.shape), jnp.asarray(index))
-    while begin + given < rows.shape[1]:
+    while begin + encoded_frames < rows.shape[1]:
         tokens = codec.encode(Video(window))
         used = rows[:, begin : begin + count].copy()  # may be shorter in the last sequence; surplus frames are cut
         if arch.config.integrate_actions:  # sums begin with the sequence, as in training
@@ -65,11 +65,11 @@ def generate(
         drawn = sample(arch, params, *divide(inputs, params))
         whole = codec.decode({"context": tokens["context"], "future": layout.future(np.asarray(drawn))}).rgb
         if made:
-            made.append(whole[:, given:])
+            made.append(whole[:, encoded_frames:])
         else:
             made.append(whole)
         begin = begin + count - layout.context
-        given = layout.context
+        encoded_frames = layout.context
         window = whole[:, -layout.context :]
     return np.concatenate(made, axis=1)[:, lacking : rows.shape[1]]
 
@@ -78,19 +78,19 @@ def generate(
 def sample(
     arch: Architecture,
     params: Params,
-    given: Int[Array, "B L"],
+    prefix: Int[Array, "B L"],
     actions: Float[Array, "B F A"],
     keys: Key[Array, " B"],
 ) -> Int[Array, "B N"]:
     """Continues the sequences of given frames, and returns their part after the context: F later frames.
 
     Args:
-        given: sequences of the context and possibly of later frames.
+        prefix: sequences of the context and possibly of later frames.
         actions: actions of all later frames.
         keys: keys of each clip's draws.
     """
     layout = arch.layout
-    clips, begin = given.shape
+    clips, begin = prefix.shape
     network = LLaMA(arch)
     later = actions.shape[1] - (begin - layout.first_slot) // layout.per_frame
     end = layout.length(layout.context + actions.shape[1])
@@ -123,11 +123,11 @@ def sample(
 
     # One more position, because a slot follows the last frame too.
     cache = unstack_params(empty_cache(arch, clips, end + 1), blocks, unroll)
-    slot = jnp.full((clips, 1), layout.slot, given.dtype)
-    start = forward(cache, jnp.concatenate([given, slot], axis=1), 0)
+    slot = jnp.full((clips, 1), layout.slot, prefix.dtype)
+    start = forward(cache, jnp.concatenate([prefix, slot], axis=1), 0)
     slots = begin + layout.per_frame * jnp.arange(later)
     _, drawn = jax.lax.scan(frame, start, slots)
-    return jnp.concatenate([given[:, layout.first_slot :], drawn.transpose(2, 0, 1).reshape(clips, -1)], axis=1)
+    return jnp.concatenate([prefix[:, layout.first_slot :], drawn.transpose(2, 0, 1).reshape(clips, -1)], axis=1)
 
 
 def pick(settings: TopKConfig, logits: Float[Array, "B V"], keys: Key[Array, " B"]) -> Int[Array, " B"]:

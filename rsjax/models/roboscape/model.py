@@ -275,8 +275,9 @@ class RoboScape(WorldModel[Batch]):
 
     def _tokens(self, assets: Assets, video: Video, arch: Architecture) -> tuple[Tokens, np.ndarray]:
         """Returns a video's tokens by branch (depth if network and a clip have it), and which clips have depth."""
-        seen = views(video, arch.depth != "none", arch.second_view)
-        return {branch: jnp.asarray(grid) for branch, grid in self._codec(assets).encode(seen).items()}, seen.has_depth
+        inputs = views(video, arch.depth != "none", arch.second_view)
+        tokens = self._codec(assets).encode(inputs)
+        return {branch: jnp.asarray(grid) for branch, grid in tokens.items()}, inputs.has_depth
 
     def _action_inputs(self, assets: Assets, actions: Float[np.ndarray, "B T A"]) -> Float[Array, "B T A2"]:
         """Returns what the action encoder reads."""

@@ -131,10 +131,10 @@ def start(
     known = slice(base, past - unread(arch))
     readings = None
     if known.stop > base:
-        seen = {branch: cells[:, known] for branch, cells in tokens.items()}
-        mask = jnp.zeros(seen["rgb"].shape, bool)
+        prompt_tokens = {branch: cells[:, known] for branch, cells in tokens.items()}
+        mask = jnp.zeros(prompt_tokens["rgb"].shape, bool)
         rows = window_actions(arch, actions[:, known], before, 0)
-        _, cache, trunk = apply_network(arch, sample, params, seen, mask, rows, 0, cache, no_depth)
+        _, cache, trunk = apply_network(arch, sample, params, prompt_tokens, mask, rows, 0, cache, no_depth)
         readings = read_state(arch, params, trunk)
 
     kept = remembered_frames(arch, sample)
@@ -238,8 +238,8 @@ def _decode_frame(
 
     def later_pass(number: Array, carry: tuple[Frame, Any]) -> tuple[Frame, Any]:
         frame, _ = carry
-        seen = {branch: x[:, None] for branch, x in mean_codes.read(sample, frame.tokens, frame.means).items()}
-        logits, _, trunk = network(seen, frame.mask[:, None], rows[:, 1:], state.position, cache, previous=last)
+        read_now = {branch: x[:, None] for branch, x in mean_codes.read(sample, frame.tokens, frame.means).items()}
+        logits, _, trunk = network(read_now, frame.mask[:, None], rows[:, 1:], state.position, cache, previous=last)
         frame = unmask(keys[:, number], number, frame, {branch: x[:, 0] for branch, x in logits.items()})
         return frame, read_state(arch, params, trunk)
 
@@ -297,10 +297,10 @@ def _renew_window(
     cache = state.cache
     if encoded := kept - arch.uncommitted:
         read = mean_codes.read(sample, state.tokens, state.means)
-        seen = {branch: x[:, newest][:, :encoded] for branch, x in read.items()}
+        kept_tokens = {branch: x[:, newest][:, :encoded] for branch, x in read.items()}
         rows = window_actions(arch, state.actions[:, newest][:, :encoded], base, 0)
-        mask = jnp.zeros(seen["rgb"].shape[:3], bool)
-        _, cache, _ = apply_network(arch, sample, params, seen, mask, rows, 0, cache, state.no_depth)
+        mask = jnp.zeros(kept_tokens["rgb"].shape[:3], bool)
+        _, cache, _ = apply_network(arch, sample, params, kept_tokens, mask, rows, 0, cache, state.no_depth)
     moved = replace(state, base=base, cache=cache, position=jnp.full_like(state.position, kept))
     return where(full, moved, state)
 

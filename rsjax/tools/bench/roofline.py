@@ -116,19 +116,19 @@ def bandwidth(budget: float) -> float:
 def operations(arch: Architecture, config: Config, batch: int) -> tuple[Operation, ...]:
     """Returns the operations of a training step's forward pass, without rematerialisation, embeddings and actions."""
     frames = config.clips.frames
-    found: dict[str, Operation] = {}
+    by_name: dict[str, Operation] = {}
     for modality in arch.modalities:
         for each in _branch_operations(arch, modality, frames, batch):
             name = each.name
             if not each.times:
                 continue
-            if name in found and found[name].shapes != each.shapes:
+            if name in by_name and by_name[name].shapes != each.shapes:
                 name = f"{modality}_{name}"
             times = each.times
-            if name in found:
-                times += found[name].times
-            found[name] = replace(each, name=name, times=times)
-    return tuple(found.values())
+            if name in by_name:
+                times += by_name[name].times
+            by_name[name] = replace(each, name=name, times=times)
+    return tuple(by_name.values())
 
 
 def _branch_operations(arch: Architecture, modality: str, frames: int, batch: int) -> tuple[Operation, ...]:
@@ -198,10 +198,10 @@ def tokenizer_operations(config: TokenizerConfig, image_size: int) -> dict[str, 
     tokens = jax.ShapeDtypeStruct((1, side, side), "int32")
 
     def of(method: str, x: Any) -> tuple[Operation, ...]:
-        found: dict[str, list[Operation]] = {}
+        by_name: dict[str, list[Operation]] = {}
         for each in _traced(jax.make_jaxpr(partial(network.apply, method=method))({"params": params}, x).jaxpr, bf16):
-            found.setdefault(each.name, []).append(each)
-        return tuple(replace(each[0], times=len(each)) for each in found.values())
+            by_name.setdefault(each.name, []).append(each)
+        return tuple(replace(each[0], times=len(each)) for each in by_name.values())
 
     return {"encode": of("encode", images), "decode": of("decode", tokens)}
 

@@ -250,9 +250,9 @@ def with_first_screen(head: str, prog: str, text: str) -> str:
     if screen.used:
         lines += ["", "Used most:"]
     for option in screen.used:
-        found = re.search(rf"^  (?:-\w, )?--{re.escape(option)}(?:[ ,\n].*\n?)(?:   .*\n)*", text, re.MULTILINE)
-        if found:  # a preset may lack a field
-            lines += [line.rstrip() for line in found[0].splitlines()]
+        match = re.search(rf"^  (?:-\w, )?--{re.escape(option)}(?:[ ,\n].*\n?)(?:   .*\n)*", text, re.MULTILINE)
+        if match:  # a preset may lack a field
+            lines += [line.rstrip() for line in match[0].splitlines()]
     return "\n".join(lines)
 
 

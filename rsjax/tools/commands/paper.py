@@ -60,8 +60,8 @@ def main() -> None:
     options = parse_options(sys.argv[1:], PROG, Options.__doc__ or "", Options())
     require(1 <= options.seeds <= MOST_SEEDS, f"--seeds is {options.seeds}; it must be 1 … {MOST_SEEDS}")
     require(options.first_seed >= 0, f"--first-seed is {options.first_seed}; it must be at least 0")
-    given = {f"eval.{name}": getattr(options, name) for name in FILES if getattr(options, name)}
-    preset = with_values(presets.get(options.preset), given)
+    files = {f"eval.{name}": getattr(options, name) for name in FILES if getattr(options, name)}
+    preset = with_values(presets.get(options.preset), files)
     # This import loads JAX, so it comes after the arguments have been parsed.
     from rsjax.tools.studies.paper import run
     from rsjax.tools.studies.paper.budget import VARY_EVERYTHING, parse_duration, scale

@@ -68,26 +68,26 @@ class Instruction:
 
     @cached_property
     def op_name(self) -> str:
-        found = re.search(r'op_name="((?:[^"\\]|\\.)*)"', self.attributes)
-        if found is None:
+        match = re.search(r'op_name="((?:[^"\\]|\\.)*)"', self.attributes)
+        if match is None:
             return ""
-        return found[1].replace("\\'", "'")
+        return match[1].replace("\\'", "'")
 
     @cached_property
     def called(self) -> tuple[str, ...]:
         """Names of the computations that it calls, without those that only combine elements (``to_apply``)."""
         pattern = r"\b(?:calls|body|branch_computations|true_computation|false_computation)=(\{[^}]*\}|%?[\w.\-]+)"
-        found = re.findall(pattern, self.attributes.partition(", metadata=")[0])
+        groups = re.findall(pattern, self.attributes.partition(", metadata=")[0])
         if self.opcode == "call":
-            found = re.findall(r"\bto_apply=(%?[\w.\-]+)", self.attributes)
-        return tuple(name for group in found for name in re.findall(r"[\w.\-]+", group))
+            groups = re.findall(r"\bto_apply=(%?[\w.\-]+)", self.attributes)
+        return tuple(name for group in groups for name in re.findall(r"[\w.\-]+", group))
 
     def attribute(self, name: str) -> str:
         """Returns the text of an attribute, without braces; "" without it."""
-        found = re.search(rf"\b{name}=(?:\{{([^}}]*)\}}|([^\s,]+))", self.attributes)
-        if found is None:
+        match = re.search(rf"\b{name}=(?:\{{([^}}]*)\}}|([^\s,]+))", self.attributes)
+        if match is None:
             return ""
-        return found[1] or found[2] or ""
+        return match[1] or match[2] or ""
 
     def integers(self, name: str) -> tuple[int, ...]:
         """Returns the numbers in an attribute."""
@@ -194,14 +194,14 @@ def bits(dtype: str) -> int:
 def arrays(text: str) -> tuple[Array, ...]:
     """Parses the arrays of a shape; a tuple's are flat."""
     parsed = []
-    for found in _ARRAY.finditer(_COMMENT.sub("", text)):
-        layout = found[4] or ""
+    for match in _ARRAY.finditer(_COMMENT.sub("", text)):
+        layout = match[4] or ""
         tile = re.search(r"T\(([\d,]*)\)", layout)
         space = re.search(r"S\((\d+)\)", layout)
         array = Array(
-            dtype=found[1],
-            dims=_numbers(found[2]),
-            order=_numbers(found[3]),
+            dtype=match[1],
+            dims=_numbers(match[2]),
+            order=_numbers(match[3]),
             tile=_numbers(tile and tile[1]),
             space=sum(_numbers(space and space[1])),
         )
@@ -216,8 +216,8 @@ def _numbers(text: str | None) -> tuple[int, ...]:
 def _closing(text: str) -> int:
     """Returns the position after the parenthesis that closes the one at the start of ``text``."""
     depth = 0
-    for found in re.finditer(r"[()]", text):
-        depth += {"(": 1, ")": -1}[found[0]]
+    for match in re.finditer(r"[()]", text):
+        depth += {"(": 1, ")": -1}[match[0]]
         if depth == 0:
-            return found.end()
+            return match.end()
     return len(text)

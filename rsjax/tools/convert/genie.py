@@ -153,9 +153,9 @@ def _check_settings(path: Path, settings: dict[str, Any], inferred: dict[str, An
     written = {name: value for name, value in settings.items() if value is not None}
     for name, only in FIXED.items():
         if written.get(name, only) != only:
-            given = json.dumps(written[name])
+            value = json.dumps(written[name])
             known = json.dumps(only)
-            raise ConvertError(f"{path}: {name} {given} is not supported, only {known}")
+            raise ConvertError(f"{path}: {name} {value} is not supported, only {known}")
     names = inferred.keys() & written.keys() - {"num_heads", "use_mup", "attn_drop", "mlp_drop"}
     wrong = [f"{n} is {written[n]}, not {x}" for n, x in inferred.items() if n in names and written[n] != x]
     if wrong:

@@ -141,21 +141,21 @@ def infer_config(
         raise ConvertError(f"{source}: the network inferred from its tensors cannot be built: {error}") from error
 
 
-def _conditioning(source: object, inputs: int, frames: int, told: Conditioning | None) -> Conditioning:
+def _conditioning(source: object, inputs: int, frames: int, chosen: Conditioning | None) -> Conditioning:
     """Returns whether an encoder of so many numbers reads one action at a time, or all frames - 1 of a clip."""
     if frames < 2 or inputs % (frames - 1):
-        if told == "video":
+        if chosen == "video":
             raise ConvertError(
                 f"{source}: reads {inputs} numbers, which the {frames - 1} actions of a clip do not divide; leave out "
                 f"--conditioning video"
             )
         return "frame"
-    if told is None and (inputs, frames) != PUBLIC_VIDEO:
+    if chosen is None and (inputs, frames) != PUBLIC_VIDEO:
         raise ConvertError(
             f"{source}: reads {inputs} numbers, which are one action or those of all {frames - 1} in a clip; set "
             f"--conditioning frame or --conditioning video"
         )
-    return told or "video"
+    return chosen or "video"
 
 
 def _grid(source: object, tensors: Tensors, names: Names) -> tuple[int, int]:

@@ -165,10 +165,10 @@ def _convert(source: Path, out: Path, heads: int | None) -> list[str]:
                 f"{source}: its metadata {METADATA} are of another version or damaged ({error})"
             ) from error
     if "dynamics_quantize.embedding.weight" in tensors:
-        given = None
+        networks = None
         if own is not None:
-            given = (own[0].autoencoder, own[1].image_size)
-        vq, size, params = tokenizer_from_public(source, tensors, given, names)
+            networks = (own[0].autoencoder, own[1].image_size)
+        vq, size, params = tokenizer_from_public(source, tensors, networks, names)
         before = saved_part(out, IVideoGPTConfig, "world_model")
         model = replace(before[0] if before else IVideoGPTConfig(), autoencoder=vq)
         _check_codes(out, before and before[0], model)

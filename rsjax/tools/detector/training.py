@@ -174,21 +174,21 @@ def measure(footage: Sequence[RunFeatures]) -> list[dict[str, Any]]:
     require(len(kinds) > 1, f"all runs are on the same clips ({kinds[0]}); to measure, give runs on others as well")
     rows = []
     with Progress("detector", len(footage), "runs") as progress:
-        for number, held in enumerate(footage):
-            others = [each for each in footage if each.clips != held.clips]
-            rows += tested(train(others), held, "clips")
-            strangers = [each for each in others if each.family != held.family]
+        for number, left_out in enumerate(footage):
+            others = [each for each in footage if each.clips != left_out.clips]
+            rows += tested(train(others), left_out, "clips")
+            strangers = [each for each in others if each.family != left_out.family]
             if strangers:
-                rows += tested(train(strangers), held, "clips and family")
+                rows += tested(train(strangers), left_out, "clips and family")
             progress.update(number + 1)
     return rows
 
 
-def tested(detector: Detector, held: RunFeatures, without: str) -> list[dict[str, Any]]:
+def tested(detector: Detector, left_out: RunFeatures, without: str) -> list[dict[str, Any]]:
     """Returns a row for each treatment: how a detector does on a run."""
-    about = {"run": held.name, "family": held.family, "clips": held.clips, "without": without}
+    about = {"run": left_out.name, "family": left_out.family, "clips": left_out.clips, "without": without}
     return [
-        about | {"treatment": name} | scores(detector(held.real[name]), detector(held.generated[name]))
+        about | {"treatment": name} | scores(detector(left_out.real[name]), detector(left_out.generated[name]))
         for name in TREATMENTS
     ]
 

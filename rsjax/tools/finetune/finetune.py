@@ -62,9 +62,9 @@ def prepare(source: StartingModel, store: Store, settings: Finetuning, out: Path
     with make_once(folder, key, refuse=OTHERS) as work:
         if not work.finished:
             write_start(source, folder)
-            found = measure_tokenizer(source, store)
-            adapts = settings.tokenizer == "adapt" or (settings.tokenizer == "measure" and not found.good)
-            work.save(adapts=adapts, **asdict(found), said=said(settings, str(found), adapts))
+            quality = measure_tokenizer(source, store)
+            adapts = settings.tokenizer == "adapt" or (settings.tokenizer == "measure" and not quality.good)
+            work.save(adapts=adapts, **asdict(quality), said=tokenizer_note(settings, str(quality), adapts))
     note(work.metadata["said"])
     share = moving_share(store)
     still = settings.keep_still == "on" or (settings.keep_still == "measure" and share < FIXED_CAMERA)
@@ -80,7 +80,7 @@ def camera_note(share: float, still: bool) -> str:
     return f"{moves}; videos keep nothing from the first frame (--keep-still on: what does not change)"
 
 
-def said(settings: Finetuning, found: str, adapts: bool) -> str:
+def tokenizer_note(settings: Finetuning, quality: str, adapts: bool) -> str:
     """Returns what was decided on the tokenizer, and why."""
     verdict = "it is kept"
     if adapts:
@@ -88,7 +88,7 @@ def said(settings: Finetuning, found: str, adapts: bool) -> str:
     rule = f"kept from {MARGIN:g} dB above that on"
     if settings.tokenizer != "measure":
         rule = f"--tokenizer {settings.tokenizer}"
-    return f"the model's tokenizer {found}; {verdict} ({rule})"
+    return f"the model's tokenizer {quality}; {verdict} ({rule})"
 
 
 def depth_advice(store: Store, config: Config) -> str:

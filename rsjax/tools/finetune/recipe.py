@@ -147,16 +147,16 @@ def moving_share(store: Store) -> float:
 
 def reversible(store: Store) -> BackwardsConfig | None:
     """Returns how the store's clips run backwards; None if one of their actions is neither a step nor a state."""
-    held = []
+    states = []
     dimensions = store.manifest.get("action_dimensions") or []
     for number, line in enumerate(dimensions):
         if line.endswith(("(held)", "(absolute)")):
-            held.append(number)
+            states.append(number)
         elif not line.endswith("(delta)"):
             return None
     if not dimensions:
         return None
-    return BackwardsConfig(held=tuple(held))
+    return BackwardsConfig(held=tuple(states))
 
 
 def of_targets(store: Store) -> bool:

@@ -77,9 +77,9 @@ def find_recordings(word: str, cutting: Cutting) -> Recordings:
     """
     path = Path(word)
     if (path / MANIFEST).exists():
-        given = [f.name for f in fields(cutting) if getattr(cutting, f.name) != f.default]
-        if given:
-            flags = ", ".join(f"--{name.replace('_', '-')}" for name in given)
+        changed = [f.name for f in fields(cutting) if getattr(cutting, f.name) != f.default]
+        if changed:
+            flags = ", ".join(f"--{name.replace('_', '-')}" for name in changed)
             raise UserError(f"{flags}: say how recordings become clips, but {path} is a store of clips; leave them out")
         return Recordings("", path)
     source, colon, rest = word.partition(":")

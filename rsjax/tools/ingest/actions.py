@@ -189,8 +189,8 @@ def _shifted(rows: Float64[np.ndarray, "N A"], offset: int, layout: ActionLayout
     if layout.kind == "delta":
         still = np.zeros(rows.shape[1])
         still[[first + 3 for first in layout.quaternions]] = 1
-        held = np.isin(np.arange(rows.shape[1]), layout.held)
-        shifted = np.where((wanted != nearest)[:, None] & ~held, still, shifted)
+        is_held = np.isin(np.arange(rows.shape[1]), layout.held)
+        shifted = np.where((wanted != nearest)[:, None] & ~is_held, still, shifted)
     return shifted
 
 
@@ -201,8 +201,8 @@ def _differences(rows: Float64[np.ndarray, "N A"], layout: ActionLayout) -> Floa
     for first in layout.quaternions:
         part = slice(first, first + 4)
         steps[:, part] = _shorter_way(_product(_unit(before[:, part]) * [-1.0, -1.0, -1.0, 1.0], _unit(rows[:, part])))
-    for held in layout.held:
-        steps[:, held] = rows[:, held]
+    for dimension in layout.held:
+        steps[:, dimension] = rows[:, dimension]
     return steps
 
 
@@ -225,8 +225,8 @@ def _composed(
         for row in rows[1:]:
             turn = _product(turn, _unit(row[part]))
         joined[part] = _shorter_way(turn)
-    for held in layout.held:
-        joined[held] = rows[-1, held]
+    for dimension in layout.held:
+        joined[dimension] = rows[-1, dimension]
     return joined
 
 

@@ -419,9 +419,9 @@ def compare(stats: dict[str, EpisodeStats], unusual: float) -> Iterator[Finding]
         stats: each episode's statistics by its id.
         unusual: as in :class:`Thresholds`.
     """
-    seen: dict[bytes, str] = {}
+    by_digest: dict[bytes, str] = {}
     for name, own in stats.items():
-        if own.digest is not None and (first := seen.setdefault(own.digest, name)) != name:
+        if own.digest is not None and (first := by_digest.setdefault(own.digest, name)) != name:
             yield Finding(name, "duplicate", f"its actions, states and first picture are those of {first}")
     if len(stats) < FEWEST:
         return

@@ -245,8 +245,8 @@ class Placement:
         else:
             method = cv2.INTER_NEAREST_EXACT
         rows, columns = target
-        seen = picture[tuple(source)]
-        small = cv2.resize(seen, (columns.stop - columns.start, rows.stop - rows.start), interpolation=method)
+        part = picture[tuple(source)]
+        small = cv2.resize(part, (columns.stop - columns.start, rows.stop - rows.start), interpolation=method)
         if small.shape[:2] == (self.size, self.size):
             return small
         square = np.zeros((self.size, self.size, *picture.shape[2:]), picture.dtype)

@@ -152,15 +152,15 @@ def errors(clip: Record, estimates: Record) -> dict[str, float]:
         track in pixels, over the later frames in which both show it, and ``visibility``, the share of points and later
         frames in which only one of them shows it. Points that frame 0 does not show do not count.
     """
-    found = {}
+    by_name = {}
     if "depth" in estimates:
         known = clip["depth"] > 0
-        found["depth"] = float(np.mean(np.abs(estimates["depth"][known] / clip["depth"][known] - 1)))
+        by_name["depth"] = float(np.mean(np.abs(estimates["depth"][known] / clip["depth"][known] - 1)))
     begun = clip["visible"][:, 0]
     if "tracks" in estimates and begun.any():
         own = clip["visible"][begun, 1:]
         made = estimates["visible"][begun, 1:]
         distance = np.linalg.norm(estimates["tracks"] - clip["tracks"], axis=-1)[begun, 1:] * clip["rgb"].shape[2]
-        found["tracks"] = float(np.sum(distance, where=own & made) / max(1, np.sum(own & made)))
-        found["visibility"] = float(np.mean(own != made))
-    return found
+        by_name["tracks"] = float(np.sum(distance, where=own & made) / max(1, np.sum(own & made)))
+        by_name["visibility"] = float(np.mean(own != made))
+    return by_name

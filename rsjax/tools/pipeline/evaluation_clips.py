@@ -82,7 +82,7 @@ def evaluation_store(run: Run, store: Store, protocol: Protocol) -> Store:
     return _simulated(f"{protocol.clips} episodes of {needed} frames; the run's have {sim.frames}", make)
 
 
-def with_second_takes(eval_clips: EvaluationClips, workers: int) -> EvaluationClips:
+def with_retakes(eval_clips: EvaluationClips, workers: int) -> EvaluationClips:
     """Adds second takes of all clips, which are simulated if necessary."""
     protocol = eval_clips.protocol
     clips = eval_clips.clips
@@ -90,7 +90,7 @@ def with_second_takes(eval_clips: EvaluationClips, workers: int) -> EvaluationCl
         raise UserError(f"protocol {protocol.name} compares with reconstructions, of which there is no second take")
 
     def make(report: Report) -> list[Record]:
-        return retakes.collect_second_takes(eval_clips.store, eval_clips.split, clips.index.tolist(), workers, report)
+        return retakes.collect_retakes(eval_clips.store, eval_clips.split, clips.index.tolist(), workers, report)
 
     takes = _simulated(f"second takes of {len(clips.rgb)} clips", make)
     return replace(eval_clips, retakes=Video(np.stack([take["rgb"][: clips.rgb.shape[1]] for take in takes])))

@@ -27,7 +27,7 @@ from rsjax.models.load_run import load, load_config
 from rsjax.models.trained import TrainedModel
 from rsjax.progress import note
 from rsjax.tools.pipeline.depth_stage import check_depth, depth_estimator
-from rsjax.tools.pipeline.evaluation_clips import chosen_splits, evaluation_store, probes_of, with_second_takes
+from rsjax.tools.pipeline.evaluation_clips import chosen_splits, evaluation_store, probes_of, with_retakes
 from rsjax.tools.pipeline.limits import GIB, host_memory
 from rsjax.tools.pipeline.metric_files import by_content, check_metric_files
 from rsjax.tools.pipeline.provenance import code_version, data_fingerprint, machine, training_settings
@@ -121,7 +121,7 @@ def evaluate_run(directory: Path, data: Path, request: EvaluationRequest) -> Ite
         chosen = EvaluationClips.read(scored_store, split, replace(protocol, splits=(split,)), config.clips)
         if request.retakes:
             name = f"{name},second-takes"
-            chosen = with_second_takes(chosen, config.runtime.workers)
+            chosen = with_retakes(chosen, config.runtime.workers)
         folder = output_directory(directory, FOLDER) / name
         evaluate_into(folder, name, trained, run, store, chosen, request.overwrite)
         yield folder
@@ -221,12 +221,12 @@ def _evaluate(
         estimator = depth_estimator(run)
         bank = make_coverage(trained, store, run.directory)
         simulated = probes_of(run, store, eval_clips)
-        found = evaluation.evaluate(trained, store, None, eval_clips, parts, estimator, simulated, bank)
+        scores = evaluation.evaluate(trained, store, None, eval_clips, parts, estimator, simulated, bank)
         about = {"label": name, "key": key, "code": code_version(Path(rsjax.__file__).resolve().parents[1])}
         about |= _described(trained, run, store, eval_clips)
-        write_result(folder, result_of(found, **about), found.kept)
+        write_result(folder, result_of(scores, **about), scores.kept)
         shutil.rmtree(parts, ignore_errors=True)
-    return found
+    return scores
 
 
 def _described(trained: TrainedModel, run: Run, store: Store, eval_clips: EvaluationClips) -> dict[str, Any]:

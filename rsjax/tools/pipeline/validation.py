@@ -147,9 +147,9 @@ class TokenizerValidation:
         pictures = {}
         for number in clips.index[:REPORT_CLIPS]:
             strips = []  # originals above reconstructions
-            for truth, seen in shown[number]:
-                figure = ClipFigure(f"clip {number} at step {step}", truth, None, reconstruction=seen, prompt_frames=0)
-                strips.append(filmstrip(figure))
+            for truth, decoded in shown[number]:
+                title = f"clip {number} at step {step}"
+                strips.append(filmstrip(ClipFigure(title, truth, None, reconstruction=decoded, prompt_frames=0)))
             pictures[f"clip_{number:03d}"] = np.concatenate(strips)
         return Validation(metric, scalars, pictures)
 
@@ -166,8 +166,8 @@ class TokenizerValidation:
         return load_clips(self._store, self.run.config.eval.clips, held_out(self._store))
 
 
-def _psnr(truth: UInt8[np.ndarray, "B T H W 3"], seen: UInt8[np.ndarray, "B T H W 3"]) -> float:
-    return float(np.mean(psnr(truth, seen)))
+def _psnr(truth: UInt8[np.ndarray, "B T H W 3"], predicted: UInt8[np.ndarray, "B T H W 3"]) -> float:
+    return float(np.mean(psnr(truth, predicted)))
 
 
 def record_batches(

@@ -102,12 +102,12 @@ async def _step(viewer: Viewer, message: Message) -> Message:
     began = time.monotonic()
     branch = session.grown.branch(whole(message, "branch", 0, MOST_NUMBER))
     source = message.get("source")
-    given = message.get("action")
-    if (source is None) == (given is None) or not isinstance(source, dict | None):
+    numbers = message.get("action")
+    if (source is None) == (numbers is None) or not isinstance(source, dict | None):
         raise Refused("bad_message", "a step has either an action, a list of numbers, or a source, an object")
     if source is not None:
-        given = await viewer.sourced(branch, source)
-    action, clipped = session.run.controls.action(given)
+        numbers = await viewer.sourced(branch, source)
+    action, clipped = session.run.controls.action(numbers)
     frame = await session.step(branch.number, action)
     viewer.sources.acted(branch, source)
     await viewer.show(branch.number, frame, message["id"])

@@ -69,11 +69,11 @@ class Controls:
             raise Refused("bad_action", "an action is of numbers alone")
         if not all(-MOST <= number <= MOST for number in numbers):  # nor is NaN
             raise Refused("bad_action", f"an action is of finite numbers, from -{MOST:g} to {MOST:g}")
-        given = np.asarray(numbers, np.float32)
-        given = np.tile(given, self.width // len(given))
+        wanted = np.asarray(numbers, np.float32)
+        wanted = np.tile(wanted, self.width // len(wanted))
         low, high = self.limits
-        taken = np.clip(given, low, high)
-        return taken, int((taken != given).sum())
+        taken = np.clip(wanted, low, high)
+        return taken, int((taken != wanted).sum())
 
     @property
     def limits(self) -> tuple[Float32[np.ndarray, " A"], Float32[np.ndarray, " A"]]:

@@ -68,8 +68,8 @@ class Guard:
 
     def knows(self, query: Mapping[str, str]) -> bool:
         """Returns whether a request contains the token."""
-        given = query.get("token", "")
-        return not self.token or secrets.compare_digest(given.encode(), self.token.encode())
+        token = query.get("token", "")
+        return not self.token or secrets.compare_digest(token.encode(), self.token.encode())
 
 
 class Guarded:

@@ -34,9 +34,9 @@ def points_of(session: Session, nodes: list[Node], pane: str) -> Points:
         points = before.points[pane]
         pictures = np.stack([_picture(before, pane), _picture(node, pane)])
         tracks, visible = LucasKanade().follow(pictures, points[:, :2].copy())
-        seen = visible[:, 1] & (points[:, 2] > 0)  # a lost point stays lost
-        places = np.where(seen[:, None], tracks[:, 1], points[:, :2])
-        node.points[pane] = np.concatenate([places, seen[:, None]], axis=1).astype(np.float32)
+        in_sight = visible[:, 1] & (points[:, 2] > 0)  # a lost point stays lost
+        places = np.where(in_sight[:, None], tracks[:, 1], points[:, :2])
+        node.points[pane] = np.concatenate([places, in_sight[:, None]], axis=1).astype(np.float32)
     found: Points = nodes[-1].points[pane]
     return found
 

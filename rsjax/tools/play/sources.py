@@ -80,10 +80,10 @@ class Sources:
                 raise Refused("no_source", str(error)) from error
             acting = self.acting[branch.number] = Acting(kind, act)
         state = branch.nodes[-1].state
-        seen = {"rgb": state.rgb[None]}
+        last_frame = {"rgb": state.rgb[None]}
         if session.has_depth and (depth := session.engine.branching(True).depth(state)) is not None:
-            seen["depth"] = depth[None]
-        return np.asarray(acting.act(seen), np.float32)[0]
+            last_frame["depth"] = depth[None]
+        return np.asarray(acting.act(last_frame), np.float32)[0]
 
     def acted(self, branch: Branch, source: dict[str, Any] | None) -> None:
         """Notes that an action of this source (None: a person) led to the branch's last frame."""

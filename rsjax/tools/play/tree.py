@@ -138,6 +138,6 @@ class Memories:
 
     def forget(self, node: Node) -> None:
         """Notes that a frame no longer has a large memory."""
-        found = self._nodes.pop(id(node), None)
-        if found is not None:
-            self._bytes -= found[1]
+        entry = self._nodes.pop(id(node), None)
+        if entry is not None:
+            self._bytes -= entry[1]

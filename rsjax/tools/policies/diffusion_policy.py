@@ -144,9 +144,9 @@ class Windows:
         cfg = self.model.config
         model = self.model
         now = int(rng.integers(len(demo["rgb"]) - 1))
-        seen = np.maximum(np.arange(now - cfg.observations + 1, now + 1), 0)
+        observed = np.maximum(np.arange(now - cfg.observations + 1, now + 1), 0)
         top, left = rng.integers(model.image_size - model.cropped + 1, size=2)
-        frames = demo["rgb"][seen, top : top + model.cropped, left : left + model.cropped]
+        frames = demo["rgb"][observed, top : top + model.cropped, left : left + model.cropped]
         controls = demo["actions"][1:].reshape(-1, model.width)
         rows = np.minimum(now * model.controls + np.arange(cfg.horizon), len(controls) - 1)
         return {"frames": frames, "controls": self.range.scale(controls[rows])}

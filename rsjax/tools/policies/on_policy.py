@@ -85,19 +85,19 @@ def rollouts(
     """
     plans: dict[str, tuple[EpisodePlan, ...]] = {}
     for split, numbers in episodes.items():
-        found: dict[int, EpisodePlan] = {}
+        by_episode: dict[int, EpisodePlan] = {}
         for place, (policy_name, policy) in enumerate(policies.items()):
-            mine = [FIRST_EPISODE + number for number in numbers[place :: len(policies)]]
-            if not mine:
+            episodes_of_policy = [FIRST_EPISODE + number for number in numbers[place :: len(policies)]]
+            if not episodes_of_policy:
                 continue
-            seeds = [clip_seed({"seed": config.seed, "episode": episode}) for episode in mine]
+            seeds = [clip_seed({"seed": config.seed, "episode": episode}) for episode in episodes_of_policy]
             title = f"{name}: {policy_name} in the simulator, {split}"
             made = act(policy, world, seeds, steps, folder / "actions" / split / policy_name, title)
-            for episode, actions in zip(mine, made, strict=True):
+            for episode, actions in zip(episodes_of_policy, made, strict=True):
                 manner = {"mode": POLICY, "policy": policy_name}
                 replay = Replay(actions, 0.0, manner)
-                found[episode] = EpisodePlan(f"{split}-{episode:07d}", episode, replay=replay)
-        plans[split] = tuple(found[episode] for episode in sorted(found))
+                by_episode[episode] = EpisodePlan(f"{split}-{episode:07d}", episode, replay=replay)
+        plans[split] = tuple(by_episode[episode] for episode in sorted(by_episode))
     sim = replace(config, frames=steps + 1)
     keys = [policy.key for policy in policies.values()]
     key = content_key("on-policy episodes", RECIPE, sim, str(keys), str(dict(episodes)), world.count)

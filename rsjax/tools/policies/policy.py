@@ -57,8 +57,8 @@ class Policy:
             frames: those so far; the first is repeated if the policy observes more.
         """
         model = self.model
-        seen = np.maximum(np.arange(len(frames) - model.config.observations, len(frames)), 0)
-        alike = np.repeat(frames[None, seen], count, axis=0)
+        observed = np.maximum(np.arange(len(frames) - model.config.observations, len(frames)), 0)
+        alike = np.repeat(frames[None, observed], count, axis=0)
         plan = _plan(without_training(model), self.params, alike, jax.random.key(seed))
         return self.range.unscale(np.asarray(plan)).reshape(count, -1, self.action_dim)
 

@@ -202,11 +202,11 @@ def training_of(policy: Path) -> str:
 def replicates(runs: Mapping[str, RunData]) -> dict[str, str]:
     """Returns for each run the name of the first run that differs from it in the seeds of its trainings alone."""
     first: dict[str, str] = {}
-    found = {}
+    by_key = {}
     for name, run in runs.items():
         config = run.config
         data = config.data or replace(config.sim, seed=0)
         settings = json.dumps(training_settings(config), sort_keys=True)
         key = content_key(settings, config.model, config.prompt_frames, data)
-        found[name] = first.setdefault(key, name)
-    return found
+        by_key[name] = first.setdefault(key, name)
+    return by_key

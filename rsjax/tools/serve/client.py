@@ -145,10 +145,10 @@ class RemoteWorldModelEnv(gymnasium.Env[Any, Any]):
             self.client.close()
             raise ServerError(error) from error
         side = facts["image_size"]
-        seen: dict[str, spaces.Space[Any]] = {"rgb": spaces.Box(0, 255, (side, side, 3), np.uint8)}
+        observed: dict[str, spaces.Space[Any]] = {"rgb": spaces.Box(0, 255, (side, side, 3), np.uint8)}
         if "depth_high" in facts:
-            seen["depth"] = spaces.Box(0.0, facts["depth_high"], (side, side))
-        self.observation_space = spaces.Dict(seen)
+            observed["depth"] = spaces.Box(0.0, facts["depth_high"], (side, side))
+        self.observation_space = spaces.Dict(observed)
         self.action_space = spaces.Box(facts["action_low"], facts["action_high"])
         self.render_mode = render_mode
         self._max_steps = max_steps

@@ -303,8 +303,8 @@ def _in_the_image(camera: Camera, places: list[dict[str, Float[np.ndarray, " 3"]
     """Returns (x, y) of object and gripper in each frame, in the units of tracks, and the object's width in frame 0."""
     names = list(places[0])
     xy, depth = camera.project(np.array([[place[name] for name in names] for place in places]))
-    seen = {name: xy[:, k].tolist() for k, name in enumerate(names)}
-    return seen | {f"{names[0]}_width": width / (camera.extent * float(depth[0, 0]))}
+    placed = {name: xy[:, k].tolist() for k, name in enumerate(names)}
+    return placed | {f"{names[0]}_width": width / (camera.extent * float(depth[0, 0]))}
 
 
 def _track_pixels(

@@ -74,9 +74,9 @@ def local_model(text: str) -> str:
             element.attrib.pop("memory", None)
         for name, value in element.attrib.items():
             if name.startswith("file"):
-                _, found, inner = value.replace("\\", "/").rpartition("/models/assets/")
+                _, separator, inner = value.replace("\\", "/").rpartition("/models/assets/")
                 path = (assets / inner).resolve()
-                if not found or not path.is_relative_to(assets) or not path.is_file():
+                if not separator or not path.is_relative_to(assets) or not path.is_file():
                     raise PlaybackError(
                         f"the model names the file {value!r:.200}, which the installed robosuite does not have"
                     )

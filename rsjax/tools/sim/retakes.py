@@ -21,9 +21,7 @@ RECIPE = 1  # raise when the same clips give different second takes
 MAX_START = 2.0  # grey levels: largest mean difference of frame 0; two OpenGL libraries differ by less
 
 
-def collect_second_takes(
-    clips: Store, split: str, numbers: Sequence[int], workers: int, report: Report
-) -> list[Record]:
+def collect_retakes(clips: Store, split: str, numbers: Sequence[int], workers: int, report: Report) -> list[Record]:
     """Collects a second take of each of these clips, unless it exists, and returns the takes in the clips' order.
 
     Args:

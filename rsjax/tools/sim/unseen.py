@@ -47,8 +47,8 @@ def collect_unseen(config: SimConfig, clips: Store, episodes: int, report: Repor
     tasks = config.held_out_tasks
     for split in unseen_splits(config):
         if split in CHANGES:
-            seen = range(first, first + episodes)
-            plans = [EpisodePlan(f"{split}-{i:06d}", i, task_of(config, i), CHANGES[split]) for i in seen]
+            numbers = range(first, first + episodes)
+            plans = [EpisodePlan(f"{split}-{i:06d}", i, task_of(config, i), CHANGES[split]) for i in numbers]
         else:
             new = range(config.episodes, config.episodes + episodes)
             plans = [EpisodePlan(f"{split}-{i:06d}", i, tasks[i % len(tasks)]) for i in new]

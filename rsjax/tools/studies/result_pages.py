@@ -121,12 +121,12 @@ def generated(root: Path, page: Path) -> str:
     Raises:
         UserError: a table names a file or a part that does not exist.
     """
-    return GENERATED.sub(lambda found: f"{found['start']}{_table(root, page, found)}{found['end']}", page.read_text())
+    return GENERATED.sub(lambda match: f"{match['start']}{_table(root, page, match)}{match['end']}", page.read_text())
 
 
-def _table(root: Path, page: Path, found: re.Match[str]) -> str:
+def _table(root: Path, page: Path, match: re.Match[str]) -> str:
     try:
-        return part_of(root, found["name"], found["part"]) + "\n"
+        return part_of(root, match["name"], match["part"]) + "\n"
     except UserError as error:
         raise UserError(f"{page.relative_to(root)}: {error}") from error
 
@@ -169,9 +169,9 @@ def differences(root: Path) -> Iterator[str]:
     for page in pages(root):
         where = page.relative_to(root)
         text = page.read_text()
-        for found in GENERATED.finditer(text):
-            if found["table"] != _table(root, page, found):
-                yield f"{where}: table {found['name']} {found['part']} differs from {DATA}/{found['name']}.json"
+        for match in GENERATED.finditer(text):
+            if match["table"] != _table(root, page, match):
+                yield f"{where}: table {match['name']} {match['part']} differs from {DATA}/{match['name']}.json"
         if page.parent == root / FOLDER:
             for line in re.findall(r"^\|.*$", GENERATED.sub("", text), re.MULTILINE)[:1]:
                 yield f"{where}: a table outside the marks of a generated one: {line[:60]}"

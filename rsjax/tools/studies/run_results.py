@@ -59,8 +59,8 @@ def write_runs(path: Path, runs: Sequence[Run]) -> None:
     names = [f"{name}{suffix}" for name in (*COLUMNS, LIFTED, *PROBES) for suffix in ROWS]
     scores = []
     for run in runs:
-        found = read_metrics(run)
-        if found is None:
+        measured = read_metrics(run)
+        if measured is None:
             raise UserError(f"{run.directory}: not a finished run; finish it with rsjax train")
         require(
             _without_seeds(asdict(run.config)) == _without_seeds(asdict(runs[0].config)),
@@ -68,7 +68,7 @@ def write_runs(path: Path, runs: Sequence[Run]) -> None:
         )
         per_clip = read_per_clip(run)
         clips = {name: [rounded(x, CLIP_DIGITS) for x in per_clip[name]] for name in names if name in per_clip}
-        numbers = {name: rounded(found[name], SEED_DIGITS) for name in names if name in found}
+        numbers = {name: rounded(measured[name], SEED_DIGITS) for name in names if name in measured}
         scores.append({"seed": run.config.train.seed, "metrics": numbers, "clips": clips})
     about = {"kind": KIND, "preset": runs[0].config.name}
     write_file(path, as_text(about | provenance(runs) | {"runs": scores}).encode())

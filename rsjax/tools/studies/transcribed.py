@@ -41,9 +41,9 @@ def transcribed_table(content: Mapping[str, Any]) -> Table:
     for row, p in zip(rows, adjusted, strict=True):
         low, high = (_number(bound) for bound in row[place[INTERVAL]].split(" … "))
         lower = any(cell in judge["lower"] for cell in row)
-        found = verdict(Estimate((low + high) / 2, low, high), "lower" if lower else "higher")
+        finding = verdict(Estimate((low + high) / 2, low, high), "lower" if lower else "higher")
         cells: list[CellText] = list(row)
-        cells[place["verdict"]] = found if p < SIGNIFICANT else "cannot tell"
+        cells[place["verdict"]] = finding if p < SIGNIFICANT else "cannot tell"
         cells.insert(place["p"] + 1, p_text(p))
         judged.append(cells)
     return Table([*head[: place["p"] + 1], "p by Holm", *head[place["p"] + 1 :]], judged)

@@ -249,7 +249,7 @@ def test_second_takes_are_a_result_of_their_own(run: Run, folder: Path, monkeypa
         list(evaluate_run(run.directory, run.data_directory, EvaluationRequest("paper", CHANGES, retakes=True)))
     takes: list[np.ndarray] = []
     whole = [{"rgb": np.full((FRAMES + 2, 8, 8, 3), i, np.uint8)} for i in range(toy.TEST)]
-    monkeypatch.setattr(retakes, "collect_second_takes", lambda clips, split, numbers, *_: [whole[i] for i in numbers])
+    monkeypatch.setattr(retakes, "collect_retakes", lambda clips, split, numbers, *_: [whole[i] for i in numbers])
 
     def evaluate(*inputs: Any) -> Evaluation:
         eval_clips: EvaluationClips = inputs[3]

@@ -14,7 +14,7 @@ from rsjax.tools.sim.collect import Collection, Report
 from rsjax.tools.sim.episode import EpisodePlan, Replay, run_episode, source_name
 from rsjax.tools.sim.lift import LiftSim
 from rsjax.tools.sim.recipes.plans import scripted
-from rsjax.tools.sim.retakes import collect_second_takes
+from rsjax.tools.sim.retakes import collect_retakes
 from rsjax.tools.sim.unseen import UNITS
 
 CONFIG = SimConfig(episodes=4, test_episodes=2, frames=4, tracks=20, seed=5)
@@ -51,7 +51,7 @@ def test_a_replay_without_jitter_is_the_clip(sim: LiftSim) -> None:
 
 def test_second_takes_start_alike_and_move_a_little_otherwise(store: Store) -> None:
     source = store.source("test")
-    takes = collect_second_takes(store, "test", [1, 0], 1, ignore)
+    takes = collect_retakes(store, "test", [1, 0], 1, ignore)
     for number, take in zip((1, 0), takes, strict=True):
         clip = source[number]
         assert take["provenance"]["episode"] == clip["provenance"]["episode"]
@@ -76,7 +76,7 @@ def test_second_takes_of_paired_clips_do_not_take_each_others_place(sim: LiftSim
     clips = [encode_clip(run_episode(sim, CONFIG, plan)) for plan in pair]
     meta = {name: value for name, value in store.manifest.items() if name != "splits"}
     write_store(tmp_path / "pair", "clips", {"pair": iter(clips)}, meta)
-    takes = collect_second_takes(open_store(tmp_path / "pair"), "pair", [1, 0], 1, ignore)
+    takes = collect_retakes(open_store(tmp_path / "pair"), "pair", [1, 0], 1, ignore)
     assert [take["provenance"]["expert"] for take in takes] == [clip["provenance"]["expert"] for clip in clips[::-1]]
     assert [take["provenance"]["difficulty"] for take in takes] == ["difficult"] * 2
 
@@ -87,13 +87,13 @@ def test_clips_of_another_simulator_or_of_none_are_refused(
     other = EpisodePlan("x", 2, change="camera")  # starts otherwise, as in another version of the simulator
     monkeypatch.setattr(retakes, "_plan", lambda *_: other)
     with pytest.raises(UserError, match="second take of episode 2 starts otherwise than the clip"):
-        collect_second_takes(store, "test", [0], 1, ignore)
+        collect_retakes(store, "test", [0], 1, ignore)
     monkeypatch.setattr(retakes, "_plan", lambda *_: EpisodePlan("x", 0))
     with pytest.raises(UserError, match="the simulator failed at the second take of episode 2; score without them"):
-        collect_second_takes(store, "test", [0, 0], 1, ignore)
+        collect_retakes(store, "test", [0, 0], 1, ignore)
     plain = replace(store, manifest={k: v for k, v in store.manifest.items() if k != "config"})
     with pytest.raises(UserError, match="these clips were not simulated"):
-        collect_second_takes(plain, "test", [0], 1, ignore)
+        collect_retakes(plain, "test", [0], 1, ignore)
 
 
 def test_clips_from_the_middle_of_an_episode_have_no_second_takes(store: Store, tmp_path: Path) -> None:
@@ -101,5 +101,5 @@ def test_clips_from_the_middle_of_an_episode_have_no_second_takes(store: Store, 
     record["provenance"]["window"] = 2
     write_store(tmp_path / "late", "clips", {"test": [record]}, store.manifest)
     with pytest.raises(UserError) as refused:
-        collect_second_takes(open_store(tmp_path / "late"), "test", [0], 1, ignore)
+        collect_retakes(open_store(tmp_path / "late"), "test", [0], 1, ignore)
     assert "begin in the middle of an episode" in str(refused.value)

@@ -95,20 +95,20 @@ class LucasKanade(GridTracker):
         grey = [cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for picture in pictures]
         size = np.array(pictures.shape[2:0:-1], np.float32)
         place = points.astype(np.float32) * size - 0.5
-        seen = np.ones(len(points), bool)
+        in_sight = np.ones(len(points), bool)
         patch = _patches(grey[0], place, self.window)
         places = [place]
-        visible = [seen]
+        visible = [in_sight]
         for before, after in itertools.pairwise(grey):
             stays = np.abs(_patches(after, place, self.window) - patch).max(1, initial=0.0) <= self.still
-            going = np.flatnonzero(seen & ~stays)
+            going = np.flatnonzero(in_sight & ~stays)
             place = place.copy()
-            seen = stays
-            place[going], seen[going] = self._step(before, after, place[going])
+            in_sight = stays
+            place[going], in_sight[going] = self._step(before, after, place[going])
             now = _patches(after, place, self.window)
-            patch = np.where(seen[:, None], now, patch)
+            patch = np.where(in_sight[:, None], now, patch)
             places.append(place)
-            visible.append(seen)
+            visible.append(in_sight)
         return ((np.stack(places, 1) + 0.5) / size).astype(np.float32), np.stack(visible, 1)
 
     def _step(
@@ -174,10 +174,10 @@ def track_in_spans(frames: Frames, follow: Follower, grid: int, span: int, depth
             maps = depth.read(range(start, end))
         else:
             maps = None
-        places, seen = follow(frames.read(range(start, end)), points[going, start], maps)
+        places, visible_here = follow(frames.read(range(start, end)), points[going, start], maps)
         points[going, start:end] = places
         points[going, end:] = places[:, -1:]
-        visible[going, start + 1 : end] = seen[:, 1:]
+        visible[going, start + 1 : end] = visible_here[:, 1:]
     return Tracked(points, visible)
 
 
@@ -259,10 +259,10 @@ class SpatialTracker(GridTracker, NetworkAnnotator):
         maps = torch.from_numpy(measured[kept]).to(self.device)[:, None]
         rows = torch.from_numpy(queries)[None].to(self.device)
         with torch.no_grad():
-            places, seen, _ = model(video, video_depth=maps, queries=rows, wind_length=self.window)
+            places, in_sight, _ = model(video, video_depth=maps, queries=rows, wind_length=self.window)
         places = places[0, :count].permute(1, 0, 2).cpu().numpy()
-        seen = seen[0, :count].permute(1, 0).cpu().numpy()
-        return _cleaned((places[..., :2] + 0.5) / size, seen.astype(bool), points)
+        in_sight = in_sight[0, :count].permute(1, 0).cpu().numpy()
+        return _cleaned((places[..., :2] + 0.5) / size, in_sight.astype(bool), points)
 
     def build(self) -> Any:
         require_weights(self.weights, self.title)
@@ -305,19 +305,19 @@ class BootsTapir(GridTracker, NetworkAnnotator):
             output = model(video, torch.from_numpy(rows.astype(np.float32))[None].to(self.device))
             hidden = torch.sigmoid(output["occlusion"][0])
             far = torch.sigmoid(output["expected_dist"][0])
-        seen = ((1 - hidden) * (1 - far) > 0.5).cpu().numpy()
-        return _cleaned(output["tracks"][0].cpu().numpy() / self.side, seen, points)
+        in_sight = ((1 - hidden) * (1 - far) > 0.5).cpu().numpy()
+        return _cleaned(output["tracks"][0].cpu().numpy() / self.side, in_sight, points)
 
     def build(self) -> Any:
         module = checkout_module(self.checkout, "tapnet.torch.tapir_model", self.title)
         return load_weights(module.TAPIR(pyramid_level=1), self.weights, self.device, self.title)
 
 
-def _cleaned(places: np.ndarray, seen: np.ndarray, points: Points) -> Followed:
+def _cleaned(places: np.ndarray, in_sight: np.ndarray, points: Points) -> Followed:
     """Undoes what networks do amiss: they move points of the first frame, and call points outside visible."""
     if not np.isfinite(places).all():
         raise AnnotationError("the tracker gave places that are not finite; check its weights and precision")
-    seen = seen & ((places >= 0) & (places < 1)).all(-1)
+    in_sight = in_sight & ((places >= 0) & (places < 1)).all(-1)
     places[:, 0] = points
-    seen[:, 0] = True
-    return places.astype(np.float32), seen
+    in_sight[:, 0] = True
+    return places.astype(np.float32), in_sight

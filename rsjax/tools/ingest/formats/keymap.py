@@ -48,8 +48,8 @@ class KeyMap:
     def to_json(self) -> dict[str, Any]:
         """Returns the map as it is written to a file, without the fields that a file may omit."""
         blank = asdict(KeyMap({}, (), 0.0)) | {"names": self.names}
-        said = ("kind", "held")  # always written, so that users see them; in a file, null means not declared
-        return {name: value for name, value in asdict(self).items() if name in said or value != blank[name]}
+        always = ("kind", "held")  # always written, so that users see them; in a file, null means not declared
+        return {name: value for name, value in asdict(self).items() if name in always or value != blank[name]}
 
 
 def _cameras(*names: str) -> dict[str, str]:

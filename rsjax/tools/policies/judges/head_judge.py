@@ -73,5 +73,5 @@ def head_judge(trained: TrainedModel, run: Path | None = None) -> HeadJudge:
         )
     if run is None or not (run / FOLDER / VALIDATION).exists():
         return HeadJudge()
-    found = read_json(run / FOLDER / VALIDATION, cure="validate them again: rsjax judge RUN --head")
-    return HeadJudge(int(found.get("in_a_row", 1)), found)
+    validation = read_json(run / FOLDER / VALIDATION, cure="validate them again: rsjax judge RUN --head")
+    return HeadJudge(int(validation.get("in_a_row", 1)), validation)

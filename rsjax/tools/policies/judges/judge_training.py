@@ -97,8 +97,8 @@ def make_judge(
     learned, fitted = _training(trained, clips, settings)
     judge = replace(train_judge(learned, fitted, settings.steps, settings.seed), in_a_row=settings.in_a_row)
     numbers = spread(clips.source("test"), settings.validation_clips)
-    held = [clip for _, clip in readable(clips.source("test"), numbers)]
-    result = validation(trained, judge, held) | {"settings": vars(settings), "judge": judge.key}
+    test_clips = [clip for _, clip in readable(clips.source("test"), numbers)]
+    result = validation(trained, judge, test_clips) | {"settings": vars(settings), "judge": judge.key}
     judge.save(run / FOLDER)
     write_json(run / FOLDER / VALIDATION, result)
     return result
@@ -106,13 +106,13 @@ def make_judge(
 
 def validation(trained: TrainedModel, judge: Judge, clips: Sequence[Record]) -> dict[str, Any]:
     """Validates a judge on clips as they are, as the tokenizer reconstructs them, and as the model generates them."""
-    held = Clips.stacked(clips, range(len(clips)))
+    batch = Clips.stacked(clips, range(len(clips)))
     first = trained.config.prompt_frames
-    raw = Footage(held.rgb, held.success)
-    result = {"clips": len(clips), "raw": validate(judge, raw, first, spoil=True)}
-    if (seen := _reconstructed(trained, raw.rgb)) is not None:
-        result["reconstructed"] = validate(judge, Footage(seen, raw.success), first)
-    made = imagined(trained, held)
+    raw = Footage(batch.rgb, batch.success)
+    result = {"clips": len(clips), "raw": validate(judge, raw, first, corrupt=True)}
+    if (decoded := _reconstructed(trained, raw.rgb)) is not None:
+        result["reconstructed"] = validate(judge, Footage(decoded, raw.success), first)
+    made = imagined(trained, batch)
     return result | {"generated": validate(judge, Footage(made.rgb, raw.success), first)}
 
 
@@ -128,20 +128,20 @@ def validate_heads(
     trained = load(run)
     head_judge(trained, run)
     source = _clips_of(trained, run, data_dir, store).source("test")
-    held = [clip for _, clip in readable(source, spread(source, settings.validation_clips))]
-    result = head_validation(trained, HeadJudge(settings.in_a_row), held) | {"settings": vars(settings)}
+    test_clips = [clip for _, clip in readable(source, spread(source, settings.validation_clips))]
+    result = head_validation(trained, HeadJudge(settings.in_a_row), test_clips) | {"settings": vars(settings)}
     write_json(run / HEAD_FOLDER / VALIDATION, result)
     return result
 
 
 def head_validation(trained: TrainedModel, judge: HeadJudge, clips: Sequence[Record]) -> dict[str, Any]:
     """Validates a model's own success head on true frames, each predicted from those before it, and on rollouts."""
-    held = Clips.stacked(clips, range(len(clips)))
+    batch = Clips.stacked(clips, range(len(clips)))
     first = trained.config.prompt_frames
-    success = held.success[:, first:]
+    success = batch.success[:, first:]
     truth = np.where(success, SUCCESS, FAIL).ravel()
-    forced = trained.model.teacher_forced(trained.params, trained.assets, held.video, held.actions, first)
-    made = imagined(trained, held).frames(first)
+    forced = trained.model.teacher_forced(trained.params, trained.assets, batch.video, batch.actions, first)
+    made = imagined(trained, batch).frames(first)
     assert forced is not None and forced.state is not None and made.state is not None
     result: dict[str, Any] = {"clips": len(clips), "judge": judge.key, "in_a_row": judge.in_a_row}
     for kind, state in (("raw", forced.state), ("generated", made.state)):
@@ -184,9 +184,9 @@ def _training(trained: TrainedModel, clips: Store, settings: JudgeSettings) -> t
         raise UserError(f"{clips.path}: {len(records)} readable training clips; a judge needs 2 at least")
     raw = Footage(*(np.stack([clip[name] for clip in records]) for name in ("rgb", "success")))
     parts = [raw]
-    seen = _reconstructed(trained, raw.rgb[: settings.reconstructed])
-    if seen is not None:
-        parts.append(Footage(seen, raw.success[: len(seen)]))
+    decoded = _reconstructed(trained, raw.rgb[: settings.reconstructed])
+    if decoded is not None:
+        parts.append(Footage(decoded, raw.success[: len(decoded)]))
     if settings.generated:
         some = Clips.stacked(records[: settings.generated], range(min(len(records), settings.generated)))
         parts.append(Footage(imagined(trained, some).rgb, some.success))
@@ -194,8 +194,8 @@ def _training(trained: TrainedModel, clips: Store, settings: JudgeSettings) -> t
     whole = Footage(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("rgb", "success")))
     if len(raw.rgb) < FITTED:  # so few clips serve both purposes
         return whole, whole
-    held = numbers % FITTED == FITTED - 1
-    return Footage(whole.rgb[~held], whole.success[~held]), Footage(whole.rgb[held], whole.success[held])
+    fits = numbers % FITTED == FITTED - 1
+    return Footage(whole.rgb[~fits], whole.success[~fits]), Footage(whole.rgb[fits], whole.success[fits])
 
 
 def _reconstructed(trained: TrainedModel, rgb: np.ndarray) -> np.ndarray | None:

@@ -140,7 +140,7 @@ class LanguageJudge:
 
         text = {"type": "text", "text": f"{self.question} Answer with one word: yes, no or unclear."}
         settings = {"add_generation_prompt": True, "tokenize": True, "return_dict": True, "return_tensors": "pt"}
-        found = []
+        labels = []
         for video in frames:
             last = video[-self.frames :]
             images: list[dict[str, Any]] = [{"type": "image", "image": Image.fromarray(frame)} for frame in last]
@@ -148,8 +148,8 @@ class LanguageJudge:
             inputs = self.processor.apply_chat_template(chat, **settings)
             made = self.model.generate(**inputs, max_new_tokens=8, do_sample=False)
             answer = self.processor.decode(made[0, inputs["input_ids"].shape[1] :], skip_special_tokens=True)
-            found.append(answer_label(answer))
-        return np.eye(len(LABELS))[found]
+            labels.append(answer_label(answer))
+        return np.eye(len(LABELS))[labels]
 
 
 def answer_label(answer: str) -> int:

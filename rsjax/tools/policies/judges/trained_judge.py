@@ -1,7 +1,7 @@
 """A small network that judges a task from the last four frames; it learns from frames that the simulator labelled.
 
-"Uninterpretable" is its third class, trained on frames that are spoilt on purpose: shuffled blocks, two clips on top of
-one another, heavy noise, heavy blur. The validation also judges spoilt held-out frames.
+"Uninterpretable" is its third class, trained on frames that are corrupted on purpose: shuffled blocks, two clips on
+top of one another, heavy noise, heavy blur. The validation also judges corrupted held-out frames.
 
 Axes: B videos, F frames of a history, H×W pixels.
 """
@@ -43,8 +43,8 @@ VALIDATION = "validation.json"
 VALIDATED = ("raw", "reconstructed", "generated")  # kinds of videos in a validation
 MOST_SIDE = 4096
 SIDE = 64  # pixels; frames with a longer side are downsampled for the network
-BATCH = 64  # histories in a training step, of which a quarter are spoilt
-SPOILT = BATCH // 4
+BATCH = 64  # histories in a training step, of which a quarter are corrupted
+CORRUPTED = BATCH // 4
 CHUNK = 256  # histories in a forward pass, at most
 
 
@@ -147,13 +147,13 @@ def load_judge(folder: Path, side: int | None = None) -> TrainedJudge:
         )
     params = unflatten_dict({tuple(name.split("/")): x for name, x in record.items()})
     judge = TrainedJudge(params, temperature, trained_on, in_a_row=in_a_row)
-    found = None
+    validation = None
     if report.exists():
-        found = read_json(report, cure="train the judge again")
-        _check_validation(report, found)
+        validation = read_json(report, cure="train the judge again")
+        _check_validation(report, validation)
     # An interrupted training may have left the validation of an earlier judge. Older validations do not name the judge.
-    if found and found.get("judge", judge.key) == judge.key:
-        return replace(judge, validation=found)
+    if validation and validation.get("judge", judge.key) == judge.key:
+        return replace(judge, validation=validation)
     return judge
 
 
@@ -192,19 +192,19 @@ class Footage:
         return self.rgb[videos[:, None], back]
 
 
-def train_judge(footage: Footage, held: Footage, steps: int, seed: int = 0) -> TrainedJudge:
+def train_judge(footage: Footage, validation: Footage, steps: int, seed: int = 0) -> TrainedJudge:
     """Trains a judge; the result depends on the arguments alone.
 
     Args:
         footage: training videos, which must show both success and failure.
-        held: held-out videos, on which the temperature is fitted.
+        validation: held-out videos, on which the temperature is fitted.
         steps: steps of Adam, with batches of ``BATCH``.
 
     Raises:
         UserError: the videos show only success, or only failure.
     """
-    found = [np.argwhere(footage.success == done) for done in (True, False)]
-    if not all(map(len, found)):
+    of_label = [np.argwhere(footage.success == done) for done in (True, False)]
+    if not all(map(len, of_label)):
         raise UserError(
             f"the simulator calls {footage.success.mean():.0%} of {footage.success.size} training frames a success; a "
             f"judge needs clips of both success and failure"
@@ -225,15 +225,15 @@ def train_judge(footage: Footage, held: Footage, steps: int, seed: int = 0) -> T
 
     with Progress("judge", steps, "steps") as progress:
         for number in range(steps):
-            params, state = step(params, state, *_batch(footage, found, rng))
+            params, state = step(params, state, *_batch(footage, of_label, rng))
             progress.update(number + 1)
-    return TrainedJudge(params, _temperature(params, held, rng), height)
+    return TrainedJudge(params, _temperature(params, validation, rng), height)
 
 
-def spoilt(
+def corrupted(
     frames: UInt8[np.ndarray, "B F H W 3"], others: UInt8[np.ndarray, "B F H W 3"], rng: np.random.Generator
 ) -> UInt8[np.ndarray, "B F H W 3"]:
-    """Returns histories that nobody can interpret, each spoilt in one of four ways.
+    """Returns histories that nobody can interpret, each corrupted in one of four ways.
 
     If the side is not a multiple of 8, shuffled blocks and blur leave a border unchanged.
 
@@ -258,13 +258,13 @@ def spoilt(
     return np.clip(np.round(out), 0, 255).astype(np.uint8)
 
 
-def _batch(footage: Footage, found: list[np.ndarray], rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Draws histories and their labels: half of them successes, then a quarter of all spoilt.
+def _batch(footage: Footage, of_label: list[np.ndarray], rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Draws histories and their labels: half of them successes, then a quarter of all corrupted.
 
     Contrast, brightness, position (by up to 2 pixels) and noise change a little, as generated frames vary.
     """
     half = BATCH // 2
-    chosen = np.concatenate([each[rng.integers(len(each), size=half)] for each in found])
+    chosen = np.concatenate([each[rng.integers(len(each), size=half)] for each in of_label])
     drawn = footage.histories(*chosen.T)
     one = (len(drawn), 1, 1, 1, 1)
     shifted = np.roll(drawn, rng.integers(-2, 3, 2), axis=(2, 3)).astype(np.float32)
@@ -272,19 +272,20 @@ def _batch(footage: Footage, found: list[np.ndarray], rng: np.random.Generator) 
     varied += rng.uniform(0, 10, one) * rng.standard_normal(drawn.shape, np.float32)
     frames = np.clip(np.round(varied), 0, 255).astype(np.uint8)
     labels = np.repeat([SUCCESS, FAIL], half)
-    rows = rng.permutation(BATCH)[:SPOILT]
-    others = (rows + rng.integers(1, BATCH, SPOILT)) % BATCH  # never the same history
-    frames[rows] = spoilt(frames[rows], frames[others], rng)
+    rows = rng.permutation(BATCH)[:CORRUPTED]
+    others = (rows + rng.integers(1, BATCH, CORRUPTED)) % BATCH  # never the same history
+    frames[rows] = corrupted(frames[rows], frames[others], rng)
     labels[rows] = UNINTERPRETABLE
     return frames, labels
 
 
-def _temperature(params: Any, held: Footage, rng: np.random.Generator) -> float:
+def _temperature(params: Any, validation: Footage, rng: np.random.Generator) -> float:
     """Returns the temperature under which the held-out labels are most probable."""
-    found = [each for each in (np.argwhere(held.success == done) for done in (True, False)) if len(each)]
-    if len(found) < 2:
+    of_label = [each for each in (np.argwhere(validation.success == done) for done in (True, False)) if len(each)]
+    if len(of_label) < 2:
         return 1.0
-    frames, labels = (np.concatenate(part) for part in zip(*(_batch(held, found, rng) for _ in range(8)), strict=True))
+    batches = [_batch(validation, of_label, rng) for _ in range(8)]
+    frames, labels = (np.concatenate(part) for part in zip(*batches, strict=True))
     logits = np.asarray(_logits(params, frames))
     grid = np.geomspace(0.25, 8, 61)
     log_p = jax.nn.log_softmax(logits[None] / grid[:, None, None], axis=-1)

@@ -22,7 +22,7 @@ from rsjax.tools.policies.judges.judge import (
     frames_of,
     of_single_frames,
 )
-from rsjax.tools.policies.judges.trained_judge import VALIDATED, Footage, spoilt
+from rsjax.tools.policies.judges.trained_judge import VALIDATED, Footage, corrupted
 from rsjax.tools.studies.tables import ABSENT, Table, as_markdown
 
 KINDS = VALIDATED
@@ -31,31 +31,31 @@ BINS = 10
 AT_ONCE = 1024  # histories judged at once
 
 
-def validate(judge: Judge, footage: Footage, first: int = 1, spoil: bool = False) -> dict[str, Any]:
+def validate(judge: Judge, footage: Footage, first: int = 1, corrupt: bool = False) -> dict[str, Any]:
     """Judges every frame from ``first`` on, and returns counts and rates, ready for JSON.
 
     Args:
-        spoil: whether to judge also an equal number of spoilt histories, whose label is "uninterpretable".
+        corrupt: whether to judge also an equal number of corrupted histories, whose label is "uninterpretable".
     """
     videos, frames = (each.ravel() for each in np.indices(footage.success.shape)[:, :, first:])
     truth = np.where(footage.success[videos, frames], SUCCESS, FAIL)
     rng = np.random.default_rng(0)
 
-    def verdicts(judge: Judge, spoil: bool = False) -> Float[np.ndarray, "N 3"]:
+    def verdicts(judge: Judge, corrupt: bool = False) -> Float[np.ndarray, "N 3"]:
         parts = []
         for start in range(0, len(videos), AT_ONCE):
             rows = slice(start, start + AT_ONCE)
             history = footage.histories(videos[rows], frames[rows], frames_of(judge))
-            if spoil:
-                history = spoilt(history, np.roll(history, len(history) // 2, axis=0), rng)
+            if corrupt:
+                history = corrupted(history, np.roll(history, len(history) // 2, axis=0), rng)
             parts.append(judge(history))
         return np.concatenate(parts)
 
     probabilities = verdicts(judge)
     labels = truth
     single = probabilities
-    if spoil:
-        probabilities = np.concatenate([probabilities, verdicts(judge, spoil=True)])
+    if corrupt:
+        probabilities = np.concatenate([probabilities, verdicts(judge, corrupt=True)])
         labels = np.concatenate([truth, np.full(len(truth), UNINTERPRETABLE)])
     if of_single_frames(judge) is not judge:
         single = verdicts(of_single_frames(judge))
@@ -80,7 +80,7 @@ def outcomes(
         Wilson interval.
     """
     truth = np.asarray(success.any(axis=1))
-    found: dict[str, dict[str, list[float | None]]] = {}
+    by_count: dict[str, dict[str, list[float | None]]] = {}
     for count in in_a_row:
         each = [all_successes(verdicts[max(0, t - count + 1) : t + 1]) for t in range(len(verdicts))]
         called = (np.stack(each).argmax(-1) == SUCCESS).any(axis=0)
@@ -90,8 +90,8 @@ def outcomes(
             "right": (int((called == truth).sum()), len(truth)),
         }
         rates = {name: wilson(*pair) for name, pair in counts.items() if pair[1]}
-        found[str(count)] = {name: [rate.value, rate.low, rate.high] for name, rate in rates.items()}
-    return found
+        by_count[str(count)] = {name: [rate.value, rate.low, rate.high] for name, rate in rates.items()}
+    return by_count
 
 
 def scores(probabilities: Float[np.ndarray, "N 3"], truth: Int[np.ndarray, " N"]) -> dict[str, Any]:
@@ -140,13 +140,13 @@ def markdown(judge: dict[str, Any] | None) -> list[str]:
     """Returns a :func:`summary` as parts of a Markdown text: confusion matrix and calibration by kind of video."""
     if judge is None:
         return ["", "The judge has no validation.json: how far it can be trusted is unknown."]
-    found = " / ".join(LABELS)
+    labels = " / ".join(LABELS)
     rows = []
     for kind, part in judge.items():
         counts = [" / ".join(map(str, row)) if any(row) else ABSENT for row in part["confusion"]]
         rows.append([kind, *counts, f"{100 * part['right'][0]:.1f} %", f"{part['calibration_error']:.3f}"])
-    confusion_table = as_markdown(Table(("video", *LABELS, "right", "calibration error"), rows))
-    lines = ["", f"The judge on held-out clips (frames called {found}, by what they are):", "", confusion_table]
+    kinds = as_markdown(Table(("video", *LABELS, "right", "calibration error"), rows))
+    lines = ["", f"The judge on held-out clips (frames called {labels}, by what they are):", "", kinds]
     if whole := whole_clips(judge):
         lines += ["", "Whole clips, by how many frames in a row must show success:", "", as_markdown(whole)]
     return lines

@@ -112,8 +112,8 @@ class PlanningActor:
             depth = np.stack([each["depth"] for each in frames])
         else:
             depth = None
-        seen = RecentFrames(np.stack([each["rgb"] for each in frames]), depth, np.stack(self._actions[-kept:]))
-        action = self._planner(seen).astype(np.float32)
+        recent = RecentFrames(np.stack([each["rgb"] for each in frames]), depth, np.stack(self._actions[-kept:]))
+        action = self._planner(recent).astype(np.float32)
         self._actions.append(action)
         self.seconds.append(time.monotonic() - began)
         return action[None]
@@ -183,9 +183,9 @@ def actors(
     return ways
 
 
-def _proposals(policy: Policy, count: int, seed: int, seen: RecentFrames) -> Float32[np.ndarray, "N F A"]:
-    """Returns a policy's plans for what a planner has seen, with other draws at each frame."""
-    return policy.plans(seen.rgb, count, zlib.crc32(seen.rgb.tobytes(), seed) >> 1)
+def _proposals(policy: Policy, count: int, seed: int, recent: RecentFrames) -> Float32[np.ndarray, "N F A"]:
+    """Returns a policy's plans from the last frames, with other draws at each frame."""
+    return policy.plans(recent.rgb, count, zlib.crc32(recent.rgb.tobytes(), seed) >> 1)
 
 
 def policy_actor(name: str, policy: Policy, trained: TrainedModel) -> MakeActor:

@@ -27,7 +27,7 @@ Score: TypeAlias = Callable[[UInt8[np.ndarray, "N F S S 3"]], Float[np.ndarray, 
 
 @dataclass(frozen=True)
 class RecentFrames:
-    """What a planner has seen of an episode.
+    """The last frames of an episode, which a planner reads.
 
     Attributes:
         rgb: the last frames.
@@ -49,7 +49,7 @@ def imagined(model: TrainedModel, score: Score, frames: int = HISTORY) -> Energy
         frames: how many of the last frames the score looks at.
     """
 
-    return lambda seen, candidates: score(_planned(model, seen, candidates, frames).rgb)
+    return lambda recent, candidates: score(_planned(model, recent, candidates, frames).rgb)
 
 
 def success(model: TrainedModel) -> Energy:
@@ -62,18 +62,18 @@ def success(model: TrainedModel) -> Energy:
     """
     head_judge(model)
 
-    def energy(seen: RecentFrames, candidates: Float[np.ndarray, "N H A"]) -> Float[np.ndarray, " N"]:
-        state = _planned(model, seen, candidates, 1).state
+    def energy(recent: RecentFrames, candidates: Float[np.ndarray, "N H A"]) -> Float[np.ndarray, " N"]:
+        state = _planned(model, recent, candidates, 1).state
         assert state is not None
         return 1 - state[:, -1, STATE.index("success")].astype(np.float64)
 
     return energy
 
 
-def _planned(model: TrainedModel, seen: RecentFrames, candidates: Float[np.ndarray, "N H A"], frames: int) -> Video:
+def _planned(model: TrainedModel, recent: RecentFrames, candidates: Float[np.ndarray, "N H A"], frames: int) -> Video:
     """Returns the last frames of the videos that the model generates for the candidates."""
-    before = np.repeat(seen.actions[None], len(candidates), axis=0)
-    prompt = Video(seen.rgb[None], None if seen.depth is None else seen.depth[None])
+    before = np.repeat(recent.actions[None], len(candidates), axis=0)
+    prompt = Video(recent.rgb[None], None if recent.depth is None else recent.depth[None])
     actions = np.concatenate([before, candidates], axis=1)
     last = min(frames, candidates.shape[1])
     return model.model.plan(model.params, model.assets, prompt, actions, depth=False, last=last)
@@ -95,8 +95,8 @@ def token_distance(model: TrainedModel, goal: UInt8[np.ndarray, "S S 3"]) -> Sco
     bits = model.config.tokenizer.code_bits
 
     def score(video: UInt8[np.ndarray, "N F S S 3"]) -> Float[np.ndarray, " N"]:
-        found = model.encode(video[:, -1:])["rgb"]
-        return np.bitwise_count(found ^ wanted).mean((1, 2, 3)) / bits
+        tokens = model.encode(video[:, -1:])["rgb"]
+        return np.bitwise_count(tokens ^ wanted).mean((1, 2, 3)) / bits
 
     return score
 

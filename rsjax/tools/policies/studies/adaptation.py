@@ -274,10 +274,10 @@ def measure(
     first: dict[str, Result] = {}
     for name, run in runs.items():
         (folder,) = evaluate_run(run, data.data_dir, EvaluationRequest("run", data=held_out))
-        found = {"own": scores_of(run), "on_policy": read_result(folder)}
-        first = first or found
+        scores = {"own": scores_of(run), "on_policy": read_result(folder)}
+        first = first or scores
         row: dict[str, Any] = {"name": name, "run": str(run)}
-        for kind, result in found.items():
+        for kind, result in scores.items():
             gains = np.subtract(result.per_clip["psnr"], first[kind].per_clip["psnr"])
             row[kind] = {"psnr": result.metrics["psnr"], "gain": asdict(bootstrap(gains)), "clips": len(gains)}
         results.append(row)

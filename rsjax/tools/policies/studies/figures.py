@@ -51,8 +51,8 @@ def side_by_side(videos: Sequence[UInt8[np.ndarray, "T S S 3"]]) -> UInt8[np.nda
     gap = np.full((length, videos[0].shape[1], GAP, 3), 255, np.uint8)
     parts: list[np.ndarray] = []
     for video in videos:
-        held = np.concatenate([video, np.repeat(video[-1:], length - len(video), axis=0)])
-        parts += [held, gap]
+        padded = np.concatenate([video, np.repeat(video[-1:], length - len(video), axis=0)])
+        parts += [padded, gap]
     return np.concatenate(parts[:-1], axis=2)
 
 

@@ -185,11 +185,11 @@ def differences(results: dict[str, Any]) -> list[dict[str, Any]]:
     """Returns the gain after the last round, compared with before and with the control."""
     last = {name: np.array([results["rounds"][-1][name]], float) for name in ("imagined", "control")}
     last["before"] = np.array([results["before"]], float)
-    found = []
+    rows = []
     for one, other in (("imagined", "before"), ("imagined", "control"), ("control", "before")):
         gap = share_difference(last[one], last[other])
-        found.append({"compares": [one, other], **asdict(gap), "verdict": verdict(gap)})
-    return found
+        rows.append({"compares": [one, other], **asdict(gap), "verdict": verdict(gap)})
+    return rows
 
 
 def rounds_table(results: dict[str, Any]) -> str:

@@ -197,18 +197,18 @@ def compared(
             "unfamiliarity": made.unfamiliarity,
             "clipped": {"simulator": true[name].clipped, "world_model": made.clipped},
         }
-    spoilt = np.mean([each["uninterpretable"] for each in policies.values()])
+    uninterpretable = np.mean([each["uninterpretable"] for each in policies.values()])
     if len(true) > 1:
-        found = _defined(asdict(agreement(x, y)))
+        agreed = _defined(asdict(agreement(x, y)))
     else:
-        found = {}
+        agreed = {}
     return {
         "run": run,
         "policies": policies,
         "same_outcome": float(np.mean(same)),
-        "uninterpretable": float(spoilt),
+        "uninterpretable": float(uninterpretable),
         "coverage": covered(policies.values()),
-        **found,
+        **agreed,
     }
 
 
@@ -239,7 +239,7 @@ def covered(policies: Iterable[Mapping[str, Any]]) -> dict[str, Any] | None:
 
 def trainings(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Returns r over the runs that differ in seeds alone, with intervals for other trainings, for each such group."""
-    found = []
+    names = []
     for like in dict.fromkeys(row["like"] for row in rows):
         group = [row for row in rows if row["like"] == like]
         policies = group[0]["policies"]
@@ -247,7 +247,7 @@ def trainings(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         x = np.array([np.mean(each["simulator"]) for each in policies.values()])
         y = np.array([[np.mean(each["world_model"]) for each in row["policies"].values()] for row in group])
         kept = inner(x)
-        found.append(
+        names.append(
             {
                 "runs": [row["run"] for row in group],
                 "policies": len(set(training.tolist())),
@@ -255,7 +255,7 @@ def trainings(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
                 "pearson_inner": _defined(asdict(over_trainings(x[kept], y[:, kept], training[kept].tolist()))),
             }
         )
-    return found
+    return names
 
 
 def _defined(numbers: dict[str, Any]) -> dict[str, Any]:

@@ -150,7 +150,7 @@ def claims(rows: Sequence[dict[str, Any]], most: int) -> list[dict[str, Any]]:
         ("more synthetic is better", f"synthetic-{most}", f"synthetic-{least}", 0.0),
         ("synthetic on top of real helps", f"real-{most}-synthetic-{most}", f"real-{most}-repeated", 0.0),
     ]
-    found = []
+    verdicts = []
     for claim, one, other, margin in wanted:
         if one != other and one in success and other in success:
             interval = share_difference(success[one], success[other])
@@ -158,13 +158,13 @@ def claims(rows: Sequence[dict[str, Any]], most: int) -> list[dict[str, Any]]:
                 holds = verdict(interval, "higher", margin)
             else:
                 holds = "cannot tell"
-            found.append(
+            verdicts.append(
                 {"claim": claim, "compares": [one, other], **asdict(interval), "margin": margin, "verdict": holds}
             )
-    return found
+    return verdicts
 
 
-def learning_tables(rows: Sequence[dict[str, Any]], found: Sequence[dict[str, Any]]) -> str:
+def learning_tables(rows: Sequence[dict[str, Any]], verdicts: Sequence[dict[str, Any]]) -> str:
     """Returns the results in Markdown."""
     policies = []
     for row in rows:
@@ -173,7 +173,7 @@ def learning_tables(rows: Sequence[dict[str, Any]], found: Sequence[dict[str, An
         policies.append([row["name"], demos, percent(share), interval_text(share), str(np.size(row["success"]))])
     lines = [as_markdown(Table(("policy", "demonstrations", "success", "95 %", "episodes"), policies))]
     differences = []
-    for claim in found:
+    for claim in verdicts:
         gap = Estimate(claim["value"], claim["low"], claim["high"])
         margin = f" (margin {100 * claim['margin']:g})" if claim["margin"] else ""
         differences.append([f"{claim['claim']}{margin}", percent(gap), interval_text(gap), claim["verdict"]])

@@ -80,15 +80,15 @@ def rejudge(out: Path, judge: Judge, name: str) -> Path:
     checked = scores(np.concatenate([verdicts["simulator"][policy] for policy in true]), truth)
     rows = []
     for row in results["runs"]:
-        labels = {policy: found.argmax(-1) for policy, found in verdicts[row["run"]].items()}
+        labels = {policy: probabilities.argmax(-1) for policy, probabilities in verdicts[row["run"]].items()}
         made = {
             policy: TrialResult(
-                (found == SUCCESS).tolist(),
+                (label == SUCCESS).tolist(),
                 row["policies"][policy]["clipped"]["world_model"],
-                (found == UNINTERPRETABLE).tolist(),
+                (label == UNINTERPRETABLE).tolist(),
                 row["policies"][policy].get("unfamiliarity", []),
             )
-            for policy, found in labels.items()
+            for policy, label in labels.items()
         }
         training = {name: each.get("training", FIRST_TRAINING) for name, each in row["policies"].items()}
         judged = {"like": row.get("like", row["run"]), "judge": summary({"raw": checked})}

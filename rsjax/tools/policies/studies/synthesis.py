@@ -186,9 +186,9 @@ def _generated(
     index = np.array(numbers)[rows] + options.seed % 2**11 * 2**20
     video = trained.model.generate(trained.params, trained.assets, prompt[rows], actions[rows], index=index)
     if judge is None:
-        found = None
+        labelled = None
     else:
-        found = labels(video.rgb[: len(clips)], judge)
+        labelled = labels(video.rgb[: len(clips)], judge)
     for row, (clip, number, (taken, clipped)) in enumerate(zip(clips, numbers, noisy, strict=True)):
         made = {
             "rgb": np.asarray(video.rgb[row]),
@@ -199,8 +199,8 @@ def _generated(
         }
         if video.depth is not None and not np.isnan(video.depth[row]).any():
             made["depth"] = np.maximum(np.asarray(video.depth[row], np.float32), 1e-3)
-        if found is not None:
-            made["success"] = found[row] == SUCCESS
+        if labelled is not None:
+            made["success"] = labelled[row] == SUCCESS
         origin = clip["provenance"]
         made["provenance"] = {
             "source": GENERATED,
@@ -210,7 +210,7 @@ def _generated(
             "noise": options.noise,
             "seed": options.seed,
             "clipped": clipped,
-            "uninterpretable": None if found is None else bool(found[row, -1] == UNINTERPRETABLE),
+            "uninterpretable": None if labelled is None else bool(labelled[row, -1] == UNINTERPRETABLE),
             "camera": str(origin.get("camera") or "image"),
             "control_steps": controls_of(clip, store.manifest),
         }

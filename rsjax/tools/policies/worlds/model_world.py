@@ -211,8 +211,8 @@ class WholeVideoImagination:
     def restart(self, which: Bool[np.ndarray, " B"], first: Video, index: Int[np.ndarray, " B"]) -> Video:
         assert which.all(), "clips begin together"
         trained = self._trained
-        seen = first if self._depth else Video(first.rgb)
-        self._frames = trained.model.reconstruct(trained.assets, seen) or seen
+        prompt = first if self._depth else Video(first.rgb)
+        self._frames = trained.model.reconstruct(trained.assets, prompt) or prompt
         self._actions = np.zeros((len(which), 1, trained.config.clips.action_dim), np.float32)
         self._index = np.asarray(index)
         self._steps = 0

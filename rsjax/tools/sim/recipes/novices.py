@@ -69,11 +69,11 @@ def reach(manner: NoviceManner, rng: np.random.Generator, see: See) -> Moves:
     wrong = (1 - manner.skill) * np.array([BIAS, BIAS, 0.01]) * rng.standard_normal(3)
     height = 0.07
     for _ in range(6):
-        seen = see().cube + wrong + (1 - manner.skill) * JITTER * rng.standard_normal(3) * np.array([1, 1, 0.3])
+        perceived = see().cube + wrong + (1 - manner.skill) * JITTER * rng.standard_normal(3) * np.array([1, 1, 0.3])
         for _ in range(PLAN):
-            yield towards(see(), seen + np.array([0, 0, height]), OPEN, manner.speed, yaw_action(see()))
-            apart = np.abs(see().gripper - seen)
+            yield towards(see(), perceived + np.array([0, 0, height]), OPEN, manner.speed, yaw_action(see()))
+            apart = np.abs(see().gripper - perceived)
             if height == 0.0 and apart[:2].max() < 0.02 and apart[2] < 0.012 + manner.early:
                 return
-        if np.hypot(*(see().gripper - seen)[:2]) < 0.03:
+        if np.hypot(*(see().gripper - perceived)[:2]) < 0.03:
             height = 0.0

@@ -52,17 +52,17 @@ def parse_group(text: str) -> tuple[str, tuple[Path, ...]]:
     name, separator, runs = text.partition("=")
     require(bool(separator and name), f"{text}: no run directory; write RUN, or NAME=RUN,RUN for several seeds")
     pieces = runs.split(",")
-    found = list[Path]()
+    folders = list[Path]()
     while pieces:
         whole = [",".join(pieces[:count]) for count in range(len(pieces), 0, -1)]
         fitting = next(((each, paths) for each in whole if (paths := _directories(each))), None)
         require(fitting is not None, f"{name}={runs}: no run directory {pieces[0]!r}; mend the path")
         assert fitting is not None
-        found += fitting[1]
+        folders += fitting[1]
         pieces = pieces[fitting[0].count(",") + 1 :]
-    repeated = [str(path) for path, count in Counter(path.resolve() for path in found).items() if count > 1]
+    repeated = [str(path) for path, count in Counter(path.resolve() for path in folders).items() if count > 1]
     require(not repeated, f"{name}: {', '.join(repeated)} is named twice; a group takes each run once")
-    return name, tuple(found)
+    return name, tuple(folders)
 
 
 def _directories(pattern: str) -> list[Path]:
@@ -191,6 +191,6 @@ def noted(groups: Sequence[Group]) -> list[str]:
     first = groups[0].results[0]
     lines = []
     for group in groups:
-        found = dict.fromkeys(line for result in group.results for line in differing(first, result, NOTED))
-        lines += [f"{groups[0].name} and {group.name}: {line}" for line in found]
+        differing_lines = dict.fromkeys(line for result in group.results for line in differing(first, result, NOTED))
+        lines += [f"{groups[0].name} and {group.name}: {line}" for line in differing_lines]
     return lines

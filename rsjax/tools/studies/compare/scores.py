@@ -97,14 +97,14 @@ def entries_of(groups: Sequence[Group]) -> list[Entry]:
     entries = [Entry(group.name, group) for group in groups]
     psnr = metrics()["psnr"]
     for suffix, name in BASELINES.items():
-        found: list[Entry] = []
+        own_entries: list[Entry] = []
         for group in groups:
             entry = Entry(name, group, suffix)
-            if entry.seeds(psnr) and not any(set(entry.seeds(psnr)) == set(other.seeds(psnr)) for other in found):
-                found.append(entry)
-        if len(found) > 1:
-            found = [replace(each, name=f"{name}, {each.group.name}") for each in found]
-        entries += found
+            if entry.seeds(psnr) and not any(set(entry.seeds(psnr)) == set(other.seeds(psnr)) for other in own_entries):
+                own_entries.append(entry)
+        if len(own_entries) > 1:
+            own_entries = [replace(each, name=f"{name}, {each.group.name}") for each in own_entries]
+        entries += own_entries
     return entries
 
 
@@ -118,7 +118,7 @@ def columns(groups: Sequence[Group], only: Sequence[str] = ()) -> list[Metric]:
     names = dict.fromkeys(name for result in results for name in result.metrics)
     suffix = depth_suffix(groups[0].results[0].protocol)
     depth = {f"depth_{each}{suffix}" for each in ("absrel", "delta1", "delta2")}
-    found = [
+    scored = [
         replace(each, column=each.column or each.name in depth) for each in metrics().values() if each.name in names
     ]
     # Parts of metrics, such as ``delta_psnr_t4``; only those of the best of samples are table columns.
@@ -133,17 +133,17 @@ def columns(groups: Sequence[Group], only: Sequence[str] = ()) -> list[Metric]:
             if best:
                 words = f"best of {part.removeprefix('_best').removesuffix(BEST)}, prompt included"
             metric = metrics()[base]
-            found.append(replace(metric, name=name, title=f"{metric.title}, {words}", column=best))
+            scored.append(replace(metric, name=name, title=f"{metric.title}, {words}", column=best))
     if not only:
-        other_depth = {each.name for each in found if each.name.startswith("depth_")} - depth
-        return [each for each in found if each.column and each.name not in other_depth]
-    known = [each.name for each in found]
+        other_depth = {each.name for each in scored if each.name.startswith("depth_")} - depth
+        return [each for each in scored if each.column and each.name not in other_depth]
+    known = [each.name for each in scored]
     for pattern in only:
         fits = any(fnmatchcase(name, pattern) for name in known)
         require(
             fits, f"--only {pattern}: no metric of these results{did_you_mean(pattern, known)} ({', '.join(known)})"
         )
-    return [each for each in found if any(fnmatchcase(each.name, pattern) for pattern in only)]
+    return [each for each in scored if any(fnmatchcase(each.name, pattern) for pattern in only)]
 
 
 def depth_suffix(protocol: Mapping[str, Any]) -> str:
@@ -193,6 +193,6 @@ def difference(entry: Entry, reference: Entry, metric: Metric) -> Difference | N
     if intervals and all(each.value == each.low == each.high == 0 for each in intervals):
         finding = "same"
     elif len(verdicts) == 1:
-        found: dict[Verdict, Finding] = {"holds": "better", "does not hold": "worse"}
-        finding = found.get(verdicts.pop(), "cannot tell")
+        words: dict[Verdict, Finding] = {"holds": "better", "does not hold": "worse"}
+        finding = words.get(verdicts.pop(), "cannot tell")
     return Difference(interval, test, finding)

@@ -136,20 +136,20 @@ def difference_table(comparison: Comparison) -> Table:
     rows = []
     for metric in comparison.metrics:
         digits = metric.decimals + 1
-        for entry, found in zip(comparison.entries, comparison.differences[metric.name], strict=True):
-            if found is None:
+        for entry, outcome in zip(comparison.entries, comparison.differences[metric.name], strict=True):
+            if outcome is None:
                 continue
-            estimate = found.interval
+            estimate = outcome.interval
             test = ABSENT
-            if found.welch:
-                estimate = estimate or found.welch.difference
-                test = f"t = {found.welch.t:.2f}, p = {found.welch.p:.3g}"
+            if outcome.welch:
+                estimate = estimate or outcome.welch.difference
+                test = f"t = {outcome.welch.t:.2f}, p = {outcome.welch.p:.3g}"
             value = f"{estimate.value:+.{digits}f}" if estimate else ABSENT
-            interval = interval_text(found.interval, digits) or ABSENT
-            finding: CellText = found.finding
-            if found.finding == "better":
+            interval = interval_text(outcome.interval, digits) or ABSENT
+            finding: CellText = outcome.finding
+            if outcome.finding == "better":
                 finding = Marked("better", "met")
-            elif found.finding == "worse":
+            elif outcome.finding == "worse":
                 finding = Marked("worse", "missed")
             rows.append([metric.heading, entry.name, value, interval, test, finding])
     head = ("metric", "entry", "difference", "95 % interval over seeds and clips", "Welch over seeds", "finding")

@@ -77,9 +77,9 @@ def parse_duration(text: str, option: str = "--budget") -> float:
         ConfigError: the text is no duration above 0.
     """
     text = text.strip()
-    found = list(_TERM.finditer(text))
-    seconds = sum(float(term[1]) * _UNITS[term[2]] for term in found)
-    whole = "".join(term[0] for term in found) == text
+    terms = list(_TERM.finditer(text))
+    seconds = sum(float(term[1]) * _UNITS[term[2]] for term in terms)
+    whole = "".join(term[0] for term in terms) == text
     require(whole and seconds > 0, f"{option} {text:.80}: not a duration; write 30min, 3h, 12h or 1h30min")
     require(seconds <= MOST_SECONDS, f"{option} {text:.80}: longer than {MOST_SECONDS // 86400} days")
     return seconds

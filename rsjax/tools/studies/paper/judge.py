@@ -188,9 +188,9 @@ def _measure(claim: Claim, comparison: ArmComparison, arms: Mapping[str, ArmScor
 
 
 def _verdict(judged: Judged) -> Verdict:
-    found = statistics.verdict(judged.difference, judged.metric.better, judged.comparison.margin)
-    if found != "cannot tell" and judged.p is not None and judged.p < SIGNIFICANT:
-        return found
+    verdict = statistics.verdict(judged.difference, judged.metric.better, judged.comparison.margin)
+    if verdict != "cannot tell" and judged.p is not None and judged.p < SIGNIFICANT:
+        return verdict
     inner = judged.inner
     margin = judged.comparison.equal_margin
     within = inner is not None and inner.low is not None and inner.high is not None

@@ -97,10 +97,10 @@ def left_out(manifest: Mapping[str, Any]) -> dict[str, int]:
 def motion_of(record: Record) -> float:
     """Returns the mean distance that tracks move between frames in which they are visible, in % of a side per frame."""
     steps = np.linalg.norm(np.diff(record["tracks"], axis=1), axis=-1)
-    seen = record["visible"][:, 1:] & record["visible"][:, :-1]
-    if not seen.any():
+    visible = record["visible"][:, 1:] & record["visible"][:, :-1]
+    if not visible.any():
         return 0.0
-    return float(100 * steps[seen].mean())
+    return float(100 * steps[visible].mean())
 
 
 def histogram(values: Sequence[float], unit: str, bins: int = 24) -> str:

@@ -76,7 +76,7 @@ def _log_clip(rerun: Any, recording: Any, name: str, record: Record) -> None:
         if record.get("depth") is not None:
             depth = rerun.DepthImage(record["depth"][frame], meter=1.0 if metres else None)
             recording.log(f"{name}/depth", depth)
-        seen = np.flatnonzero(record["visible"][:, frame])
-        pixels = record["tracks"][seen, frame] * (rgb.shape[1], rgb.shape[0])
-        recording.log(f"{name}/camera/tracks", rerun.Points2D(pixels, keypoint_ids=seen.astype(np.uint16)))
+        visible = np.flatnonzero(record["visible"][:, frame])
+        pixels = record["tracks"][visible, frame] * (rgb.shape[1], rgb.shape[0])
+        recording.log(f"{name}/camera/tracks", rerun.Points2D(pixels, keypoint_ids=visible.astype(np.uint16)))
         recording.log(f"{name}/actions", rerun.Scalars(record["actions"][frame]))

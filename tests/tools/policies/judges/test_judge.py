@@ -20,8 +20,8 @@ from rsjax.tools.policies.judges.trained_judge import (
     Footage,
     JudgeNetwork,
     TrainedJudge,
+    corrupted,
     load_judge,
-    spoilt,
     train_judge,
 )
 from rsjax.tools.policies.judges.validation import confusion_table, markdown, scores, summary, validate
@@ -47,7 +47,7 @@ def judge() -> TrainedJudge:
 
 
 def test_a_judge_tells_success_from_failure_and_from_spoilt_frames(judge: TrainedJudge) -> None:
-    result = validate(judge, footage(20, 2), spoil=True)
+    result = validate(judge, footage(20, 2), corrupt=True)
     assert result["right"][0] > 0.8, result
     assert np.sum(result["confusion"]) == 2 * 20 * 5
     assert all(result[f"{label}_found"][0] > 0.6 for label in LABELS), result
@@ -130,7 +130,7 @@ def test_histories_end_with_their_frame() -> None:
 
 def test_every_history_is_spoilt_and_in_several_ways() -> None:
     frames, rng = footage(40, 4).rgb[:, :HISTORY], np.random.default_rng(0)
-    changed = np.abs(spoilt(frames, frames[::-1], rng).astype(float) - frames).mean((1, 2, 3, 4))
+    changed = np.abs(corrupted(frames, frames[::-1], rng).astype(float) - frames).mean((1, 2, 3, 4))
     assert changed.min() > 1 and changed.max() > 10 * changed.min()
 
 
@@ -141,7 +141,7 @@ def test_no_history_is_put_on_top_of_itself(monkeypatch: pytest.MonkeyPatch) -> 
         pairs.append((frames, others))
         return frames
 
-    monkeypatch.setattr(judge_module, "spoilt", keep)
+    monkeypatch.setattr(judge_module, "corrupted", keep)
     some, rng = footage(20, 5), np.random.default_rng(0)
     found = [np.argwhere(some.success == done) for done in (True, False)]
     for _ in range(30):
@@ -152,7 +152,7 @@ def test_no_history_is_put_on_top_of_itself(monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_frames_whose_side_is_no_multiple_of_8_are_spoilt_but_for_a_border() -> None:
     frames = np.random.default_rng(0).integers(0, 256, (40, HISTORY, 21, 21, 3), np.uint8)
-    made = spoilt(frames, frames[::-1], np.random.default_rng(1))
+    made = corrupted(frames, frames[::-1], np.random.default_rng(1))
     changed = made != frames
     assert changed[:, :, :16, :16].any((1, 2, 3, 4)).all()
     border = changed[:, :, 16:].any((1, 2, 3, 4)) | changed[:, :, :, 16:].any((1, 2, 3, 4))
