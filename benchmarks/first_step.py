@@ -10,8 +10,12 @@ import os
 import subprocess
 import sys
 import tempfile
-from argparse import ArgumentParser
+from dataclasses import dataclass
 from pathlib import Path
+
+import tyro
+
+from rsjax.tools.commands.cli import main_errors, parse_options
 
 ROOT = Path(__file__).parents[1]
 PHASES = ("imports", "make", "reset", "step", "second step")
@@ -32,6 +36,18 @@ print(json.dumps([after - before for before, after in zip(began, began[1:])]))
 """
 
 
+@dataclass(frozen=True)
+class Options:
+    """Times the first step of an environment in new processes."""
+
+    run: tyro.conf.Positional[str] = tyro.MISSING
+    """A run directory, made by rsjax train; a saved model; or tiny or multitask, the package's models."""
+    processes: int = 3
+    """Processes, one after another."""
+    source: Path = ROOT
+    """The checkout to time."""
+
+
 def first_step(run: str, source: Path, cache: Path) -> dict[str, float]:
     """Returns the processor time of each phase of a new process, in seconds.
 
@@ -47,12 +63,10 @@ def first_step(run: str, source: Path, cache: Path) -> dict[str, float]:
     return dict(zip(PHASES, json.loads(done.stdout.splitlines()[-1]), strict=True))
 
 
+@main_errors()
 def main() -> None:
-    parser = ArgumentParser(prog="python -m benchmarks.first_step", description=__doc__)
-    parser.add_argument("run")
-    parser.add_argument("--processes", type=int, default=3)
-    parser.add_argument("--source", type=Path, default=ROOT, help="another checkout to time")
-    options = parser.parse_args()
+    """Prints the times of each process."""
+    options = parse_options(sys.argv[1:], "python -m benchmarks.first_step", Options.__doc__ or "", Options())
     with tempfile.TemporaryDirectory() as folder:
         for number in range(options.processes):
             times = first_step(options.run, options.source, Path(folder))

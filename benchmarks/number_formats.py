@@ -9,17 +9,19 @@ import sys
 import tempfile
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 from unittest import mock
 
 import numpy as np
+import tyro
 
 from rsjax.config import AdamW, Config, RoboScapeConfig
 from rsjax.models.base import create_autoencoder, create_model
 from rsjax.models.load_run import load_config
 from rsjax.runtime import tune_process
+from rsjax.tools.commands.cli import main_errors, parse_options
 from rsjax.tools.pipeline.run import Run
 from rsjax.tools.pipeline.stages import tokenizer_loader, world_model_loader
 from rsjax.training.log import read_log
@@ -31,6 +33,21 @@ SEEDS = (0, 1, 2)
 DOORS = ("rsjax.models.roboscape.transformer.in_feature_dtype", "rsjax.tokenizers.magvit2.in_feature_dtype")
 
 
+@dataclass(frozen=True)
+class Options:
+    """Compares the losses of trainings with features in bf16 and in float32."""
+
+    run: tyro.conf.Positional[Path] = tyro.MISSING
+    """A finished run of tiny."""
+    data: tyro.conf.Positional[Path] = tyro.MISSING
+    """Its directory of simulated data sets."""
+
+
+def unchanged(config: Config) -> Config:
+    """Returns the run's own configuration."""
+    return config
+
+
 def small_roboscape(config: Config) -> Config:
     """Returns the paper's objective and optimizer at the size of ``tiny``."""
     model = RoboScapeConfig(width=128, blocks=4, heads=4, compute_dtype="bfloat16")
@@ -38,8 +55,8 @@ def small_roboscape(config: Config) -> Config:
 
 
 TRAININGS: dict[str, tuple[str, Callable[[Config], Config]]] = {
-    "tokenizer of tiny": ("tokenizer", lambda config: config),
-    "tiny": ("world_model", lambda config: config),
+    "tokenizer of tiny": ("tokenizer", unchanged),
+    "tiny": ("world_model", unchanged),
     "roboscape_s, 4 blocks of width 128": ("world_model", small_roboscape),
 }
 
@@ -63,14 +80,15 @@ def last_loss(run: Run, part: str, seed: int, dtype: str) -> float:
         return float(np.mean([row["loss"] for row in read_log(Path(directory))[-LAST:]]))
 
 
+@main_errors()
 def main() -> None:
     """Prints the table."""
     tune_process()
-    directory = Path(sys.argv[1])
-    config = load_config(directory)
+    options = parse_options(sys.argv[1:], "python -m benchmarks.number_formats", Options.__doc__ or "", Options())
+    config = load_config(options.run)
     lines = ["| loss | seed | float32 features | bf16 features | difference |", "|---|---|---|---|---|"]
     for name, (part, change) in TRAININGS.items():
-        run = Run(change(config), directory, Path(sys.argv[2]))
+        run = Run(change(config), options.run, options.data)
         losses = np.array([[last_loss(run, part, seed, dtype) for dtype in ("float32", "bfloat16")] for seed in SEEDS])
         for seed, (exact, half) in zip(SEEDS, losses, strict=True):
             lines.append(f"| {name} | {seed} | {exact:.4f} | {half:.4f} | {half - exact:+.4f} |")

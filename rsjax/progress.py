@@ -65,11 +65,13 @@ class Progress:
         self._settled = start + settle
         self._console = console or Console()
         self._clock = clock
-        self._first = self._done = start
+        self._first = start
+        self._done = start
         self._bar: RichProgress | None = None
 
     def __enter__(self) -> Self:
-        self._began = self._shown = self._clock()
+        self._began = self._clock()
+        self._shown = self._began
         self._samples = deque([(self._began, self._first)])
         if self._console.is_terminal:
             columns = (TextColumn("  {task.description}"), BarColumn(bar_width=24), TextColumn("{task.fields[text]}"))

@@ -214,7 +214,8 @@ def stop_signals() -> Iterator[list[int]]:
 
 def _watch(pipe: int) -> None:
     """Reads signal numbers from a pipe, which Python's C handler fills whatever the main thread is doing."""
-    interrupted = deadline = float("inf")
+    interrupted = float("inf")
+    deadline = float("inf")
     while True:
         now = time.monotonic()
         wait = None if deadline == float("inf") else max(0.0, deadline - now)

@@ -81,7 +81,8 @@ class Source:
             try:
                 reader = self._reader  # another thread may reset the attribute
                 if reader is None:
-                    reader = self._reader = ArrayRecordDataSource([str(path) for path in self._paths])
+                    reader = ArrayRecordDataSource([str(path) for path in self._paths])
+                    self._reader = reader
                 return decode(reader[index])
             except Exception as error:  # array_record reports damage with several exception types
                 self._reader = None

@@ -91,7 +91,8 @@ def prepare_store(
     weights = fingerprint(params)
     tokenizer = tokenizer_key(config, weights, *more_key)
     key = tokens_key(str(clips.manifest.get("key")), tokenizer)
-    out = beside = clips.path.resolve() / FOLDER / tokenizer
+    out = clips.path.resolve() / FOLDER / tokenizer
+    beside = out
     if _is_made(beside, key, clips):
         return _listed(beside, clips, max_damaged, place)
     parent = next(folder for folder in beside.parents if folder.exists())

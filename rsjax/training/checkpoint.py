@@ -364,7 +364,8 @@ def find_fault(checkpoint: Path) -> str | None:
 
 
 def _size_and_checksum(path: Path) -> list[int]:
-    size = checksum = 0
+    size = 0
+    checksum = 0
     with regular(path).open("rb") as file:
         while chunk := file.read(CHUNK_BYTES):
             size += len(chunk)

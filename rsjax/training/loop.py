@@ -98,7 +98,9 @@ def fit(
         compiled_step = sharding.compile(train_step, model, loop)
 
         batches = stack.enter_context(Prefetch(loader(data), model.batch, sharding.put_batch))
-        log = progress = skipped_steps = None
+        log = None
+        progress = None
+        skipped_steps = None
         if is_lead():
             skipped_steps = SkippedSteps(directory, first)
             log = stack.enter_context(ScalarLog(directory, first, loop.wandb, resume=first > 0))

@@ -23,7 +23,8 @@ class StopRequest:
     """
 
     def __init__(self) -> None:
-        self._received = self._stepped = False
+        self._received = False
+        self._stepped = False
 
     def __enter__(self) -> Self:
         self._handles = threading.current_thread() is threading.main_thread()

@@ -224,7 +224,8 @@ def _traced(jaxpr: Any, bf16: bool) -> Iterator[Operation]:
             rows, columns, inputs, outputs = shapes[1]
             stride = eqn.params["window_strides"][0]
             name = f"{rows}x{columns}{f'_stride_{stride}' * (stride > 1)}_{inputs}_to_{outputs}_at_{out[1]}"
-        run = plain = partial(eqn.primitive.bind, **eqn.params)
+        run = partial(eqn.primitive.bind, **eqn.params)
+        plain = run
         if bf16 and eqn.primitive.name == "conv_general_dilated":
             run = partial(convolve, **eqn.params)
         yield Operation(name, 1, run, shapes, count_products(jax.make_jaxpr(plain)(*map(jnp.zeros, shapes)).jaxpr))

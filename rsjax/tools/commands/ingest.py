@@ -24,7 +24,8 @@ def main() -> None:
         raise ConfigError(
             f"name a source and its path first; usage: {PROG} SOURCE PATH --out STORE; sources: {', '.join(FORMATS)}"
         )
-    source = path = ""
+    source = ""
+    path = ""
     rest = argv  # --help ends the command, so that no source is needed
     if not wants_help:
         source, path, *rest = argv

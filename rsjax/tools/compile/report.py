@@ -237,7 +237,9 @@ def render(numbers: dict[str, Any], target: Target, title: str) -> RenderableTyp
 
 
 def _rows(numbers: dict[str, Any], target: Target, unit: str) -> Iterator[tuple[str, str]]:
-    fits = {True: "fits", False: "[bold red]does not fit[/]"}[numbers["fits"]]
+    fits = "[bold red]does not fit[/]"
+    if numbers["fits"]:
+        fits = "fits"
     yield "compiles", f"in {duration(numbers['compile_s'])}"
     largest = ""
     if "largest_batch" in numbers:

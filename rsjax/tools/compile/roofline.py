@@ -301,7 +301,10 @@ class _Counter:
         if kind == "collective-permute":
             pairs = zip(*[iter(one.integers("source_target_pairs"))] * 2, strict=True)
             far = any(source // self.local != target // self.local for source, target in pairs)
-            return payload, payload / {True: self.card.network, False: self.card.link}[far]
+            speed = self.card.link
+            if far:
+                speed = self.card.network
+            return payload, payload / speed
         passes = 1 + (kind == "all-reduce")
         sent = passes * payload * (1 - 1 / len(group))
         between = passes * payload * (1 - 1 / hosts) / (members * self.card.network)

@@ -76,12 +76,14 @@ class VideoFile:
     def __init__(self, path: Path, settings: VideoSettings) -> None:
         os.environ.setdefault("SVT_LOG", "1")  # errors only
         path.parent.mkdir(parents=True, exist_ok=True)
-        self.frames = self.bytes = 0
+        self.frames = 0
+        self.bytes = 0
         self._container = av.open(str(path), "w", format="mp4")
         options = {"crf": str(settings.crf), "g": str(KEY_FRAMES)}
         rate = video_rate(settings.fps)
         stream: Any = self._container.add_stream(ENCODERS[settings.codec], rate=rate, options=options)
-        stream.height = stream.width = settings.size
+        stream.height = settings.size
+        stream.width = settings.size
         stream.pix_fmt = "yuv420p"
         self._stream = stream
 
@@ -238,7 +240,8 @@ class _Layout(ABC):
         self.video = video
         self.features = features
         self.cameras = [name for name, feature in features.items() if feature["dtype"] == "video"]
-        self.episodes = self.rows = 0
+        self.episodes = 0
+        self.rows = 0
         self.tasks: dict[str, int] = {}
         (root / "meta").mkdir()
 
@@ -384,7 +387,8 @@ class _Tables:
         self._root = root
         self._template = template
         self._writer: pq.ParquetWriter | None = None
-        self._number = self._bytes = 0
+        self._number = 0
+        self._bytes = 0
 
     def place(self) -> dict[str, int]:
         """Returns the chunk and file that the next table goes to."""

@@ -15,7 +15,7 @@ from rsjax.errors import UserError
 from rsjax.processes import MAX_DEATHS, WorkerDied
 from rsjax.tools.ingest.episode import EpisodeRef
 from rsjax.tools.ingest.ingest import Settle, limit_threads
-from rsjax.tools.ingest.work_items import EpisodeWork, IngestPlan, Mark, Step, run_item
+from rsjax.tools.ingest.work_items import EpisodeWork, IngestPlan, ItemMark, Step, run_item
 
 ANSWER_SECONDS = 5.0  # time that a cluster's address has to answer
 MAX_FAILED_STARTS = 3  # of an actor, after which the installation is to blame and not a node
@@ -168,7 +168,7 @@ class _Actors:
                 break
         return ran, clips
 
-    async def _run_item(self, work: EpisodeWork, step: Step) -> Mark:
+    async def _run_item(self, work: EpisodeWork, step: Step) -> ItemMark:
         for _ in range(MAX_DEATHS):
             actor = await self._take_idle(step)
             self._running += 1
@@ -234,7 +234,7 @@ class _Actor:
         self._prepared: set[str] = set()
         limit_threads(max(1, math.ceil(self._step.cpus)))
 
-    def run(self, ref: EpisodeRef) -> Mark | UserError:
+    def run(self, ref: EpisodeRef) -> ItemMark | UserError:
         """Returns the mark of this step on an episode, or the error because of which no work item could be run."""
         try:
             return run_item(EpisodeWork(self._plan, ref), self._step, self._prepared)

@@ -13,7 +13,7 @@ from rsjax.files import disk_guard, write_atomically
 from rsjax.progress import duration
 from rsjax.tools.ingest.clips import CLIPS
 from rsjax.tools.ingest.episode import EpisodeRef
-from rsjax.tools.ingest.work_items import EpisodeWork, IngestPlan, Mark
+from rsjax.tools.ingest.work_items import EpisodeWork, IngestPlan, ItemMark
 
 QUARANTINE = "quarantine.jsonl"
 SUMMARY = "summary.json"
@@ -87,10 +87,12 @@ def summarise(
     steps: dict[str, dict[str, Any]] = {
         step.name: {"done": 0, "failed": 0, "seconds": 0.0, "cpu_seconds": 0.0} for step in plan.steps
     }
-    done = clips = cut = 0
+    done = 0
+    clips = 0
+    cut = 0
     for ref in refs:
         work = EpisodeWork(plan, ref)
-        last = Mark()
+        last = ItemMark()
         for step in plan.steps:
             mark = work.mark(step.name)
             if mark is None:

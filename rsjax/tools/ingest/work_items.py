@@ -29,7 +29,7 @@ from rsjax.tools.ingest.episode import Episode, EpisodeRef, EpisodeSource
 Summary = dict[str, Any]  # what a step says about its output, JSON-ready
 # status, stage (the step), episode, key, seconds, cpu_seconds; done: records, bytes, summary; failed: error, option,
 # traceback
-Mark = dict[str, Any]
+ItemMark = dict[str, Any]
 Inputs = Mapping[str, Source]  # the records of earlier steps, by their names
 Records = Generator[Record, None, Summary]
 
@@ -124,7 +124,7 @@ class EpisodeWork:
         key = self.keys[step]
         return self.plan.items / step / key[:2] / f"{safe_id(self.ref.id)}-{key}.array_record"
 
-    def mark(self, step: str) -> Mark | None:
+    def mark(self, step: str) -> ItemMark | None:
         """Reads a work item's mark; None if it was not run, or its output is missing or truncated."""
         output = self.output(step)
         try:
@@ -142,7 +142,7 @@ class EpisodeWork:
             return mark
         return None
 
-    def done(self, step: str) -> Mark | None:
+    def done(self, step: str) -> ItemMark | None:
         """Reads the mark of a work item that succeeded; None if it failed or was not run."""
         mark = self.mark(step)
         if mark is not None and mark["status"] == "done":
@@ -154,7 +154,7 @@ class EpisodeWork:
         output = self.output(step)
         return Source(output.parent, step, [(output.name, count)] if count else [])
 
-    def fail(self, step: str, error: BaseException, seconds: float = 0.0, cpu_seconds: float = 0.0) -> Mark:
+    def fail(self, step: str, error: BaseException, seconds: float = 0.0, cpu_seconds: float = 0.0) -> ItemMark:
         """Writes the mark of a failed work item, a row of the quarantine table."""
         if isinstance(error, UserError):
             message = str(error)
@@ -167,7 +167,7 @@ class EpisodeWork:
         }
         return self.leave(step, {"status": "failed", "seconds": seconds, "cpu_seconds": cpu_seconds, **row})
 
-    def leave(self, step: str, mark: Mark) -> Mark:
+    def leave(self, step: str, mark: ItemMark) -> ItemMark:
         """Writes a work item's mark, so that it is not run again."""
         mark = {"episode": self.ref.id, "stage": step, "key": self.keys[step]} | mark
         path = mark_path(self.output(step))
@@ -204,8 +204,6 @@ def run_episode(plan: IngestPlan, ref: EpisodeRef, prepared: set[str]) -> tuple[
             ran += 1
             if step is plan.steps[-1]:
                 clips += mark.get("records", 0)
-            else:
-                clips += 0
         if mark["status"] == "failed":
             break
     return ran, clips
@@ -215,7 +213,7 @@ class _WorkError(Exception):
     """A step's work failed on an episode; ``__cause__`` is why."""
 
 
-def run_item(work: EpisodeWork, step: Step, prepared: set[str]) -> Mark:
+def run_item(work: EpisodeWork, step: Step, prepared: set[str]) -> ItemMark:
     """Runs a work item and writes its output and mark; an error of the work becomes a failed mark.
 
     Raises:

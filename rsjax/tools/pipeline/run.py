@@ -128,7 +128,8 @@ class Run:
         for stage, parts in settings.items():
             if stage not in self.stages:
                 continue
-            key = keys[stage] = content_key(RECIPE, stage, key, *parts)
+            key = content_key(RECIPE, stage, key, *parts)
+            keys[stage] = key
         return keys
 
     @property

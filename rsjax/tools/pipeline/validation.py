@@ -141,7 +141,8 @@ class TokenizerValidation:
             colors, depth = pair
             for row, number in enumerate(clips.index[clips.has_depth]):
                 shown[number].append((colors[row], depth[row]))
-            scalars["validation/psnr_depth"] = of_depth = _psnr(colors, depth)
+            of_depth = _psnr(colors, depth)
+            scalars["validation/psnr_depth"] = of_depth
             share = cfg.tokenizer_train.depth_share
             metric = -((1 - share) * of_rgb + share * of_depth)
         pictures = {}

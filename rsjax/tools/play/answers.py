@@ -55,7 +55,8 @@ async def upload(viewer: Viewer, payload: bytes) -> Message:
     """Keeps an uploaded picture, from which a session can start."""
     try:
         size = viewer.session.run.data.config.clips.image_size
-        viewer.session.upload = made = await asyncio.to_thread(read_picture, payload, size)
+        made = await asyncio.to_thread(read_picture, payload, size)
+        viewer.session.upload = made
     except Refused as error:
         return refusal(0, error)
     return {"type": "uploaded", "id": 0} | made.describe() | {"message": made.message}

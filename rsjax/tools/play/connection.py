@@ -49,7 +49,8 @@ class Connection:
         self._hub = hub
         self._queue = SendQueue()
         self._todo: asyncio.Queue[dict[str, Any] | bytes] = asyncio.Queue(QUEUE)
-        self._steps = self._strikes = 0
+        self._steps = 0
+        self._strikes = 0
         self._over: asyncio.Future[tuple[int, str]] = asyncio.get_running_loop().create_future()
 
     async def serve(self, name: str | None) -> None:

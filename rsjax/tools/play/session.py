@@ -241,7 +241,8 @@ class Session:
             for branch in self.tree.branches.values():
                 for node in branch.nodes:
                     self._memories.forget(node)
-        self.tree = self.start = None
+        self.tree = None
+        self.start = None
 
     async def _advance(self, node: Node, action: Float32[np.ndarray, " A"], how: Decoding) -> BranchState:
         state = node.state

@@ -78,7 +78,8 @@ class Sources:
                     act = planner(session.seed, branch.nodes[0].state.rgb)
             except UserError as error:
                 raise Refused("no_source", str(error)) from error
-            acting = self.acting[branch.number] = Acting(kind, act)
+            acting = Acting(kind, act)
+            self.acting[branch.number] = acting
         state = branch.nodes[-1].state
         last_frame = {"rgb": state.rgb[None]}
         if session.has_depth and (depth := session.engine.branching(True).depth(state)) is not None:

@@ -140,7 +140,8 @@ class Viewer:
 
     def rest(self) -> None:
         """Gives the simulator back, for other viewers."""
-        self._wanted = self._chase = None
+        self._wanted = None
+        self._chase = None
         if self._follower is not None:
             self._follower.close()
             self._follower = None

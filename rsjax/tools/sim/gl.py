@@ -41,5 +41,6 @@ def choose_gl() -> str:
         usable = [name for name, library in LIBRARIES.items() if _loads(library)]
         if not usable:
             raise GLError(f"no OpenGL library (libEGL or libOSMesa) on this machine: {CURE}")
-        wanted = os.environ["MUJOCO_GL"] = usable[0]
+        wanted = usable[0]
+        os.environ["MUJOCO_GL"] = wanted
     return wanted

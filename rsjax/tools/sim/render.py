@@ -92,7 +92,8 @@ class Renderer:
         self._fine = size * SUPERSAMPLING
         model.vis.quality.shadowsize = 0
         model.vis.quality.offsamples = 0
-        model.vis.global_.offwidth = model.vis.global_.offheight = self._fine
+        model.vis.global_.offwidth = self._fine
+        model.vis.global_.offheight = self._fine
         try:
             self._gl = mujoco.GLContext(self._fine, self._fine)
         except Exception as error:  # each OpenGL binding fails in its own way
@@ -145,11 +146,13 @@ class Renderer:
         """Returns the body id at each pixel's centre; 0 (the world) where there is nothing."""
         mujoco = self._mj
         flags = self._scene.flags
-        flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = 1
+        flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = 1
+        flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = 1
         try:
             rgb, _ = self._draw(data)
         finally:
-            flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = 0
+            flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = 0
+            flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = 0
         ids = _centres(rgb).astype(np.int32) @ np.array([1, 256, 65536], np.int32)
         body_of = np.zeros(self._scene.ngeom + 1, np.int32)  # index 0: no geom
         for geom in self._scene.geoms[: self._scene.ngeom]:

@@ -197,7 +197,8 @@ def valid_answer(pictures: Sequence[UInt8[np.ndarray, "H W 3"]], ask: Ask, tries
     Raises:
         AnnotationError: none of ``tries`` answers was.
     """
-    question = prompt = PROMPT.format(count=len(pictures))
+    question = PROMPT.format(count=len(pictures))
+    prompt = question
     for _ in range(tries):
         text = ask(list(pictures), prompt)
         try:

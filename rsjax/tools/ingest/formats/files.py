@@ -170,7 +170,8 @@ def seconds(table: pa.Table, column: str, where: Path | str) -> Float64[np.ndarr
 def _numbers(table: pa.Table, column: str, where: Path | str) -> Float64[np.ndarray, "N A"]:
     if column not in table.column_names:
         raise EpisodeError(f"{where}: has no column {column!r}; it has {', '.join(table.column_names)}")
-    kind = inner = table[column].type
+    kind = table[column].type
+    inner = kind
     while pa.types.is_list(inner) or pa.types.is_large_list(inner) or pa.types.is_fixed_size_list(inner):
         inner = inner.value_type
     wrong = EpisodeError.at(where, f"column {column!r} ({kind}) is not rows of as many numbers")
