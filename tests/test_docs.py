@@ -89,6 +89,15 @@ def test_readmes_of_folders_are_short(readme: Path) -> None:
     assert len(readme.read_text().splitlines()) <= FOLDER_README
 
 
+def test_the_way_to_the_gradient_leads_through_files_that_have_what_it_names() -> None:
+    page = (ROOT / "docs" / "code.md").read_text()
+    rows = re.findall(r"^\| \d\. \[[\w/.]+\]\(\.\./(.+?)\) \| (.*) \|$", page, re.MULTILINE)
+    assert len(rows) == 8
+    for file, text in rows:
+        code = (ROOT / file).read_text()
+        assert not [name for name in re.findall(r"`(\w+)`", text) if name not in code], file
+
+
 def test_every_folder_of_code_has_a_readme() -> None:
     files = [path for folder in ("rsjax", "benchmarks") for path in (ROOT / folder).rglob("*") if path.suffix in CODE]
     assert not sorted({name_of(path.parent) for path in files if not (path.parent / "README.md").exists()})

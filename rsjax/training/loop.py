@@ -95,6 +95,7 @@ def fit(
         if exhausted(loop, checkpoints.best(), first):
             last = first
         skips = int(state.skipped)
+        # train_step(model, loop, state, batch) as one program: on one device, on many, or over a mesh.
         compiled_step = sharding.compile(train_step, model, loop)
 
         batches = stack.enter_context(Prefetch(loader(data), model.batch, sharding.put_batch))

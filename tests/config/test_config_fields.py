@@ -77,9 +77,11 @@ def test_fields_that_only_fit_together_are_set_together() -> None:
     changed = with_values(DEBUG, {"model.width": 33, "model.heads": 3})
     known = config_fields(changed)
     assert (known["model.width"].value, known["model.heads"].value) == (33, 3)
-    for alone in ({"model.width": 33}, {"tokenizer.code_bits": 9}):
-        with pytest.raises(ConfigError):
-            with_values(DEBUG, alone)
+    alone = {"model.width 33 is not divisible": {"model.width": 33}, "code_bits 9 does not": {"tokenizer.code_bits": 9}}
+    for reason, values in alone.items():
+        with pytest.raises(ConfigError) as refused:
+            with_values(DEBUG, values)
+        assert reason in str(refused.value)
 
 
 @dataclasses.dataclass(frozen=True)

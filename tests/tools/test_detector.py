@@ -78,8 +78,9 @@ def test_a_saved_detector_is_the_same_and_damage_is_noticed(detector: Detector, 
     with pytest.raises(UserError) as damaged:
         load_detector(tmp_path)
     assert "SHA-256" in str(damaged.value)
-    with pytest.raises(UserError):
+    with pytest.raises(UserError) as missing:
         load_detector(tmp_path / "nowhere")
+    assert "no detector there" in str(missing.value)
 
 
 def test_the_detector_of_the_package_knows_the_packages_clips_as_recorded() -> None:
@@ -99,8 +100,9 @@ def test_videos_and_stores_are_judged_by_pictures_and_marks(detector: Detector, 
     rsjax.write_store(tmp_path / "store", clips, test_share=0.0)
     first, second = judged(detector, tmp_path / "store", "train")
     assert "looks recorded  " in first and "looks generated; marked" in second
-    with pytest.raises(UserError):
+    with pytest.raises(UserError) as unknown:
         list(judged(detector, tmp_path / "store", "none"))
+    assert "has no split 'none'" in str(unknown.value)
 
 
 def toy_footage(name: str, family: str, clips: str) -> RunFeatures:
@@ -123,9 +125,12 @@ def test_each_run_is_tested_with_its_clips_left_out() -> None:
         measure(footage[1:])
 
 
-def test_the_command_wants_either_videos_or_runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_the_command_wants_either_videos_or_runs(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.chdir(tmp_path)
     for words in ([], ["a.mp4", "--train", "runs/tiny"]):
-        sys.argv = ["rsjax detect", *words]
+        monkeypatch.setattr(sys, "argv", ["rsjax detect", *words])
         with pytest.raises(SystemExit):
             main()
+        assert "name videos or stores to judge, or runs to --train on" in capsys.readouterr().err

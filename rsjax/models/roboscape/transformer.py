@@ -26,9 +26,9 @@ from rsjax.layers.partition import gathers
 from rsjax.layers.platform import attend_in_clip, attend_over_cache, in_feature_dtype, known_after, put_frames
 from rsjax.layers.unstacked_params import stack_params
 from rsjax.models.roboscape.architecture import Architecture
-from rsjax.models.roboscape.coarse_cells import merged, split, spread
 from rsjax.models.roboscape.departures.action_dropout import with_null_action
 from rsjax.models.roboscape.departures.adaptive_norms import ActionNorms
+from rsjax.models.roboscape.departures.coarse_depth import merged, split, spread
 from rsjax.models.roboscape.departures.motion_head import MotionHead
 from rsjax.models.roboscape.departures.norms import optional_norm
 from rsjax.models.roboscape.departures.read_previous import absent_cells, frame_before

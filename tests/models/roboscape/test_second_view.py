@@ -149,8 +149,9 @@ def test_tokens_of_both_views_are_kept_and_the_first_are_those_of_one_view(
     for name in ("rgb", "depth"):
         np.testing.assert_array_equal(tokens[name], alone[name])
     np.testing.assert_array_equal(tokens["second"], codec.encode_rgb(two.source("test")[0]["second"]))
-    with pytest.raises(StoreError):
+    with pytest.raises(StoreError) as refused:
         trained.model.prepare(one, trained.assets, tmp_path, 0.0)
+    assert "its clips have no second view" in str(refused.value)
 
 
 def test_both_views_are_generated_and_both_prompts_are_needed(

@@ -64,8 +64,9 @@ def test_a_run_directory_stands_for_its_configuration_where_that_is_allowed(tmp_
     config = dataclasses.replace(presets.get("debug"), prompt_frames=2)
     write_json(tmp_path / "config.json", to_dict(config))
     assert parse([str(tmp_path)], "prog", "", Options(), runs=True)[0] == config
-    with pytest.raises(ConfigError):
+    with pytest.raises(ConfigError) as refused:
         parse([str(tmp_path)], "prog", "", Options())
+    assert "unknown preset" in str(refused.value)
 
 
 @settings(max_examples=20, deadline=None)

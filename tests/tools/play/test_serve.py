@@ -31,8 +31,10 @@ def test_a_host_that_is_none_is_one_line(host: str) -> None:
 
 @pytest.mark.parametrize("wrong", [{"sessions": 0}, {"lanes": 0}, {"port": 2**16}, {"idle_minutes": 0.0}])
 def test_impossible_settings_are_refused(wrong: dict[str, int]) -> None:
-    with pytest.raises(ConfigError):
+    with pytest.raises(ConfigError) as refused:
         ServeSettings(**wrong)  # type: ignore[arg-type]
+    (name,) = wrong
+    assert f"{name} is" in str(refused.value).replace("-", "_")
 
 
 def test_settings_are_the_runs_and_limits_follow_from_it() -> None:

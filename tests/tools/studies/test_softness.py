@@ -37,7 +37,9 @@ def test_episodes_have_the_shape_of_the_clips_and_other_arms_are_refused() -> No
     made = softness.episodes_like(sim, 100)
     assert (made.env, made.clips.frames, made.clips.action_dim) == ("rope", 7, 21)
     assert made.seed != sim.seed and made.recipe == ("expert",)
-    with pytest.raises(ConfigError):
+    with pytest.raises(ConfigError) as refused:
         softness.episodes_like(replace(sim, env="metaworld", camera="near", recipe=("expert",)), 100)
-    with pytest.raises(ConfigError):
+    assert "clips are of Meta-World" in str(refused.value)
+    with pytest.raises(ConfigError) as refused:
         softness.episodes_like(sim, 10)
+    assert str(refused.value).startswith("--episodes is 10")

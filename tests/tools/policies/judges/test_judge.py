@@ -114,8 +114,9 @@ def test_a_judge_of_impossible_content_is_refused(judge: TrainedJudge, tmp_path:
     good = {"confusion": [[1, 0, 0], [0, 1, 0], [0, 0, 0]], "right": [1.0, 0.5, 1.0], "calibration_error": 0.1}
     for part in (None, 7, good | {"confusion": [[1]]}, good | {"right": None}, good | {"calibration_error": "x"}):
         (folder / "validation.json").write_text(json.dumps({"judge": judge.key, "raw": part}))
-        with pytest.raises(UserError):
+        with pytest.raises(UserError) as raised:
             load_judge(folder)
+        assert "its part 'raw'" in str(raised.value), part
     (folder / "validation.json").write_text(json.dumps({"judge": judge.key, "raw": good}))
     assert load_judge(folder).validation is not None
 

@@ -147,8 +147,9 @@ def test_energies_are_scores_of_what_a_model_generates() -> None:
 
 def test_success_is_read_from_the_models_own_head(tmp_path: Path) -> None:
     clips = toy.store(tmp_path / "clips")
-    with pytest.raises(UserError):
+    with pytest.raises(UserError) as refused:
         energies.success(toy.trained(clips))
+    assert "has no state heads" in str(refused.value)
     model = toy.trained(clips, toy.with_model(toy.config(), state_heads=StateHeadsConfig()))
     rgb = toy.clip(0).rgb[:2]
     rows = np.random.default_rng(0).normal(0, 0.4, (2 + 2 * 3, 28)).astype(np.float32)

@@ -369,8 +369,9 @@ def test_a_family_without_steps_is_named(clips: Store) -> None:
 
 
 def test_the_models_own_head_may_give_the_reward(clips: Store) -> None:
-    with pytest.raises(UserError):
+    with pytest.raises(UserError) as refused:
         WorldModelEnv(toy.trained(clips), judge="head")
+    assert "has no state heads" in str(refused.value)
     model = toy.trained(clips, toy.with_model(toy.config(), state_heads=StateHeadsConfig()))
     env = WorldModelEnv(model, judge="head", data_dir=clips.path.parent)
     _, info = env.reset(options={"clip": 1, "draw": 0})

@@ -1,6 +1,7 @@
-"""Joins neighbouring token cells to coarse ones and takes them apart, for a depth branch at coarser cells.
+"""A depth branch at coarser cells than RGB's (``model.depth.cells``), which costs a part of the paper's branch.
 
-A coarse cell covers n × n cells.
+Depth is smooth, so few cells may say enough of it. A coarse cell covers n × n token cells, which are joined before the
+branch and taken apart after it.
 
 Axes: B clips, T frames, S cells, s = S / n² coarse cells, C channels.
 """
