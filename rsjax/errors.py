@@ -9,7 +9,7 @@ from collections.abc import Iterable
 class UserError(Exception):
     """An error that the user can fix. The message is one line that names what is wrong and the cure.
 
-    Parts of a file's name that are no text, surrogates, are shown as escapes, since no terminal could print them.
+    Parts of a file's name that are not text, surrogates, are shown as escapes, since no terminal could print them.
 
     Not a :class:`ValueError`, because some libraries, such as the command-line parser, catch those.
 

@@ -80,7 +80,7 @@ def checked_path(path: object, what: str) -> Path:
         what: the argument, for error messages.
 
     Raises:
-        FileError: it is no path, is empty, or has characters or a length that no file name has.
+        FileError: it is not a path, is empty, or has characters or a length that no file name has.
     """
     if not isinstance(path, str | os.PathLike):
         raise FileError(f"{what} is {path!r:.80}; give a path, such as 'runs/tiny'")
@@ -105,7 +105,7 @@ def check_place(path: Path, what: str, directory: bool) -> None:
         directory: whether it will be a directory, and not a file.
 
     Raises:
-        FileError: it is no path, something of another kind is there, or nothing can be written there.
+        FileError: it is not a path, something of another kind is there, or nothing can be written there.
     """
     path = checked_path(path, what).absolute()
     try:
@@ -113,7 +113,7 @@ def check_place(path: Path, what: str, directory: bool) -> None:
             raise FileError(f"{what} is {path}: no {'directory' if directory else 'file'}; choose another path")
         place = next(each for each in (path, *path.parents) if each.is_dir() or os.path.lexists(each))
         if not place.is_dir() and place != path:
-            raise FileError(f"{what} is {path}: {place} is no directory; choose another path")
+            raise FileError(f"{what} is {path}: {place} is not a directory; choose another path")
         if directory or place != path:
             with tempfile.TemporaryFile(dir=place):
                 pass

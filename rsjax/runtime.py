@@ -115,7 +115,7 @@ def set_xla_flags() -> None:
 
 
 def collect_rarely() -> None:
-    """Makes Python look for garbage less often, since tracing a model makes millions of objects that are none.
+    """Makes Python look for garbage less often, since tracing a model makes millions of objects that are not garbage.
 
     By default it looks after every 700 new objects, which takes a sixteenth of the processor time of a short rollout.
     """

@@ -29,7 +29,7 @@ TARGETS = {
     "a path upwards": "/page/../../../etc/passwd",
     "an encoded path upwards": "/page/%2e%2e%2f%2e%2e%2fetc%2fpasswd",
     "a null byte": "/page/%00",
-    "bytes that are no text": "/page/%ff%fe",
+    "bytes that are not text": "/page/%ff%fe",
     "a path of 60,000 characters": "/" + "x" * 60_000,
     "a file of nobody": "/api/file/../../config.json",
     "a file number of 4400 digits": "/api/file/" + "9" * 4400,

@@ -260,7 +260,7 @@ def _provenance(clip: Mapping[str, Any], where: str) -> dict[str, Any]:
         json.dumps(dict(origin))
         encode(dict(origin))  # which takes integers of 64 bits only
     except (TypeError, ValueError, OverflowError) as error:
-        raise StoreError(f"{where}: provenance is no dict of JSON-ready values ({error})") from error
+        raise StoreError(f"{where}: provenance is not a dict of JSON-ready values ({error})") from error
     return dict(origin)
 
 

@@ -43,7 +43,7 @@ def over_cache(qkv: tuple[int, ...], keys: tuple[int, ...]) -> int:
 
 
 def products(rows: tuple[int, ...], kernel: tuple[int, ...], count: int) -> int:
-    """Returns the operations of so many products of rows (N, C) and a kernel (C, H) or its transpose."""
+    """Returns the operations of ``count`` products of rows (N, C) and a kernel (C, H) or its transpose."""
     return count * 2 * rows[0] * prod(kernel)
 
 

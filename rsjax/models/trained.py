@@ -243,7 +243,7 @@ def as_array(name: str, value: Any) -> np.ndarray:
     """Returns an argument as an array.
 
     Raises:
-        ShapeError: it is no array, or one with masked numbers.
+        ShapeError: it is not an array, or one with masked numbers.
     """
     if isinstance(value, np.ma.MaskedArray) and value.mask.any():
         raise ShapeError(f"{name} are masked, and a model cannot leave numbers out; fill them or pass other ones")

@@ -102,7 +102,7 @@ def load_lpips(path: str | Path, wanted_net: str = "") -> dict[str, Any]:
     try:
         with safe_open(path, framework="numpy") as file:
             metadata = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - it is no dict
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - it is not a dict
     except SafetensorError as error:
         instead = placeholder(Path(path)) or f"not a safetensors file, or damaged ({error}); make it again"
         raise LpipsError(f"{path}: {instead}") from error

@@ -26,7 +26,7 @@ def push(directory: Path, repository: str, private: bool = False) -> str:
         The address of the commit.
 
     Raises:
-        UserError: the directory is no saved model or is damaged, or the hub refuses.
+        UserError: the directory is not a saved model or is damaged, or the hub refuses.
     """
     if not is_saved(directory):
         raise UserError(f"{directory}: no saved model; make one of a run: rsjax save {directory} NAME")
@@ -48,7 +48,7 @@ def pull(repository: str, out: Path, revision: str | None = None) -> None:
         revision: a branch, tag or commit; None: the newest.
 
     Raises:
-        UserError: ``out`` holds something else, the hub refuses, or what it has is no saved model or damaged.
+        UserError: ``out`` holds something else, the hub refuses, or what it has is not a saved model or damaged.
     """
     if out.exists() and not is_saved(out) and any(out.iterdir()):
         raise UserError(f"{out}: holds something else than a saved model; choose another place")
@@ -63,7 +63,7 @@ def pull(repository: str, out: Path, revision: str | None = None) -> None:
         except Exception as error:  # as above
             raise _failed(repository, error) from error
         if not is_saved(new):
-            raise HubError(f"{repository}: holds no {TENSORS}, so it is no saved model")
+            raise HubError(f"{repository}: holds no {TENSORS}, so it is not a saved model")
         check_digests(new)
         with disk_guard(out):
             replace_directory(new, out.absolute())

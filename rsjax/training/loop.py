@@ -178,7 +178,7 @@ def exhausted(loop: LoopConfig, best: int | None, step: int) -> bool:
 
 
 def _is_due(step: int, every: int, last: int) -> bool:
-    """Returns whether something is due at this step that happens every so many steps (0: never) and at the end."""
+    """Returns whether something is due at this step that happens every ``every`` steps (0: never) and at the end."""
     return every > 0 and (step % every == 0 or step == last)
 
 

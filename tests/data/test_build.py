@@ -124,9 +124,9 @@ WRONG = [
     ({"task": 3}, "task is 3; it is text"),
     ({"skill": np.zeros(2)}, "skill is array.*; it is text"),
     ({"episode": [1]}, r"episode is \[1\]; it is a name, or a number"),
-    ({"provenance": {"seed": 10**400}}, "provenance is no dict of JSON-ready values"),
-    ({"provenance": {"seed": np.int64(3)}}, "provenance is no dict of JSON-ready values .*int64"),
-    ({"provenance": "x"}, r"provenance is no dict of JSON-ready values \(it is a str\)"),
+    ({"provenance": {"seed": 10**400}}, "provenance is not a dict of JSON-ready values"),
+    ({"provenance": {"seed": np.int64(3)}}, "provenance is not a dict of JSON-ready values .*int64"),
+    ({"provenance": "x"}, r"provenance is not a dict of JSON-ready values \(it is a str\)"),
     (
         {"tracks": np.zeros((5, FRAMES, 2)), "visible": np.ones((5, FRAMES), bool)},
         r"tracks has the shape \(5, 4, 2\), .* \(256, 4, 2\); without tracks a clip gets 256 that are never visible",

@@ -18,7 +18,7 @@ from rsjax.evaluation.metrics.psnr_motion import moved
 from rsjax.evaluation.registry import PerClip, PerFrame, Scene, metric
 
 FLAGGED = {"ghost": 0.25, "morphing": 0.5}  # a clip with a higher share shows the failure
-CONTRAST = 60.0  # distance of colours, of 442, from which a mixture of two can be told from either
+CONTRAST = 60.0  # distance of colours, of 442, from which a mixture of two can be distinguished from either
 MIXED = (0.25, 0.75)  # shares of the new colour in a mixture
 ASIDE = 0.35  # distance from the line between both colours, relative to its length, up to which a colour is a mixture
 POINTS = 32

@@ -26,7 +26,7 @@ from rsjax.layers.cpu.matmul import transposed_in_memory
 LARGE_FRAME = 128
 UNROLLED = 16  # frames whose code is written out; more take longer to compile
 BLOCKS = 4  # blocks of queries in causal attention …
-LONG = 256  # … of at least so many cells
+LONG = 256  # … of at least this many cells
 SCORES = 2**24  # the most in all frames that run at the same time: 64 MiB
 
 

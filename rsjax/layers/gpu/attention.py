@@ -233,7 +233,7 @@ def _backward_kernel(
 
 
 def _rows(tokens: Any, tile: Tile, first: Any, count: int, *part: int) -> Float[Array, "R e"]:
-    """Loads so many tokens of a tile; rows are (frame, cell)."""
+    """Loads this many tokens of a tile; rows are (frame, cell)."""
     x = tokens[(slice(None), _cells(tile, first, count), *part, slice(None))]
     return x.reshape(count, x.shape[-1])
 

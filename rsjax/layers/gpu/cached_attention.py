@@ -26,7 +26,7 @@ WARPS = 4
 
 
 def fits(qkv: tuple[int, ...], slots: int) -> bool:
-    """Returns whether :func:`attend` takes a qkv of this shape (B, F, S, 3, h, e) and a cache of so many slots.
+    """Returns whether :func:`attend` takes a qkv of this shape (B, F, S, 3, h, e) and a cache of this many slots.
 
     F is 1 or 2, head widths are 16, 32, 64 or 128, and slots are a power of two up to 4096/e.
     """

@@ -55,7 +55,7 @@ def _read_texts(path: Path, tokens: int, width: int, versions: tuple[tuple[int, 
             metadata = opened.metadata() or {}
             names = json.loads(metadata.get(TEXTS, "[]"))
             made = None
-            if EMBEDDINGS in opened.keys():  # noqa: SIM118 - it is no dict
+            if EMBEDDINGS in opened.keys():  # noqa: SIM118 - it is not a dict
                 stored = opened.get_tensor(EMBEDDINGS)
                 if not is_intact({EMBEDDINGS: stored}, metadata):
                     raise ValueError("its digest is wrong")

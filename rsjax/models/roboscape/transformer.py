@@ -273,7 +273,7 @@ class Transformer(nn.Module):
 
         Raises:
             ValueError: actions are missing; ``drop_actions`` is passed to a model without a null action; the model has
-                no positions for so many frames; or ``previous`` is missing.
+                no positions for this many frames; or ``previous`` is missing.
         """
         cfg = self.config
         departures = cfg.departures

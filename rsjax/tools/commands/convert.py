@@ -103,7 +103,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     assert options.source is not None
     assert options.out is not None
     if options.export:
-        cure = "is no directory made here, to export from; leave out --export to import a file"
+        cure = "is not a directory made here, to export from; leave out --export to import a file"
         require(options.source.is_dir(), f"{options.source}: {cure}")
         if options.kind == "ivideogpt":
             lines = ivideogpt.export(options.source, options.out, options.part)

@@ -85,7 +85,7 @@ def main() -> None:
         console.print(f"all are {kind!r}: if that is as it should be, --ignore {kind}")
     console.print(f"{total} episodes: {total - bad} without a finding, {bad} with")
     if diagnosis.mended:
-        console.print(f"mended by the reader, which is no finding: {len(diagnosis.mended)}")
+        console.print(f"mended by the reader, which is not a finding: {len(diagnosis.mended)}")
     if options.fix is not None:
         about = f"{source.name} {options.path or options.what}"
         kept, out = write_selection(options.fix, about, diagnosis.refs, reasons)

@@ -146,7 +146,7 @@ def parse(text: str) -> Module:
     """Parses a program.
 
     Raises:
-        ValueError: the text has no entry computation, so it is no program.
+        ValueError: the text has no entry computation, so it is not a program.
     """
     computations: dict[str, Computation] = {}
     entry = ""
@@ -180,7 +180,7 @@ def parse(text: str) -> Module:
             if start[1]:
                 current.root = one.name
     if not entry:
-        raise ValueError("the text is no program of XLA: it has no entry computation")
+        raise ValueError("the text is not a program of XLA: it has no entry computation")
     return Module(computations, entry)
 
 

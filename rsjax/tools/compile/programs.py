@@ -38,7 +38,7 @@ class Program:
         count: how many of them, on all devices.
         devices: the number of devices that run it.
         model_flops: operations that the model needs for them, by the model's own formula; 0 without one.
-        steps: how often a training runs it; 0: it is no training.
+        steps: how often a training runs it; 0: it is not a training.
         state_bytes: of parameters and optimizer on each device.
         lower: traces the program and returns ``jax.stages.Lowered``.
         notes: what a reader should know.

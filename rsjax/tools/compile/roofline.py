@@ -40,7 +40,7 @@ PLAIN_CALLS = {
     "TODO(b/522284627)",
 }
 COLLECTIVES = ("all-reduce", "all-gather", "reduce-scatter", "all-to-all", "collective-permute", "ragged-all-to-all")
-# Names in an operation's path that are no module of the model.
+# Names in an operation's path that are not modules of the model.
 _WRAPPERS = {
     "while",
     "body",
@@ -196,7 +196,7 @@ class _Counter:
         self.warnings: list[str] = []
 
     def kernels(self, computation: Computation, times: int = 1) -> list[Kernel]:
-        """Returns the kernels of a computation that runs so many times."""
+        """Returns the kernels of a computation that runs ``times`` times."""
         kernels: list[Kernel] = []
         started: dict[str, int] = {}  # the number of kernels before each collective that runs beside others
         for one in computation:

@@ -105,7 +105,7 @@ def _slice(name: str, family: str, number: str | None) -> Target:
     size = int(number or min(slices))
     if size not in slices:
         names = [f"{family}-{size}" for size in slices]
-        raise ConfigError(f"target {name!r} is no slice of {CARDS[family].title}; slices: {', '.join(names)}")
+        raise ConfigError(f"target {name!r} is not a slice of {CARDS[family].title}; slices: {', '.join(names)}")
     shape = slices[size]
     chips = 1
     for side in shape.split("x"):

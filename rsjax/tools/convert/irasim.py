@@ -32,7 +32,7 @@ from rsjax.trainable import Params
 METADATA = "rsjax.irasim"  # key of the architecture in the metadata of an exported file
 FIXED = ("pos_embed", "temp_embed")
 HEADS = {1152: 16, 1024: 16, 768: 12, 384: 6}  # attention heads of the public sizes, by width
-PUBLIC_VIDEO = (15 * 7, 16)  # numbers that the public Video-Ada reads, of so many frames
+PUBLIC_VIDEO = (15 * 7, 16)  # numbers that the public Video-Ada reads, and its frames
 ROUNDING = 1e-6  # of positions, whose neighbours differ by far more
 
 Conditioning = Literal["frame", "video"]
@@ -118,7 +118,7 @@ def infer_config(
             inputs = inputs // (frames - 1)
     heads = variant.heads or HEADS.get(width)
     if heads is None:
-        raise ConvertError(f"{source}: of width {width}, which is none of the public sizes; set --heads")
+        raise ConvertError(f"{source}: of width {width}, which is not a public size; set --heads")
     rows, columns = _grid(source, tensors, names)
     try:
         return Architecture(
@@ -142,7 +142,7 @@ def infer_config(
 
 
 def _conditioning(source: object, inputs: int, frames: int, chosen: Conditioning | None) -> Conditioning:
-    """Returns whether an encoder of so many numbers reads one action at a time, or all frames - 1 of a clip."""
+    """Returns whether an encoder of this many inputs reads one action at a time, or all frames - 1 of a clip."""
     if frames < 2 or inputs % (frames - 1):
         if chosen == "video":
             raise ConvertError(

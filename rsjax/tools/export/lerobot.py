@@ -129,7 +129,7 @@ def padding(frames: int, horizon: int) -> float:
 
 
 def openpi_advice(frames: int) -> str:
-    """Returns which action horizon fits episodes of so many frames; "" if openpi's default does."""
+    """Returns which action horizon fits episodes of this length; "" if openpi's default does."""
     if padding(frames, OPENPI_HORIZON) <= MOST_PADDING:
         return ""
     fitting = next(horizon for horizon in range(OPENPI_HORIZON, 0, -1) if padding(frames, horizon) <= MOST_PADDING)

@@ -96,7 +96,7 @@ def depth_advice(store: Store, config: Config) -> str:
     if not config.model.uses_depth or store.manifest.get("depth_range"):
         return ""
     return (
-        "no clip has depth: the depth loss is masked, so RGB learns as ever and predicted depth stays that of the old "
+        "no clip has depth: the depth loss is masked, RGB learns as before and predicted depth stays that of the old "
         "scenes; --depth video-depth-anything:checkout=DIR,weights=FILE estimates it (docs/annotate.md)"
     )
 

@@ -88,9 +88,9 @@ class Finetuning:
         require(0 <= self.short_share < 1, f"--short-share is {self.short_share}; it is a share of the steps, below 1")
 
     def for_clips(self, config: Config, clips: int) -> "Finetuning":
-        """Returns the settings with steps for so many training clips, where they are not given.
+        """Returns the settings with steps for this many training clips, where they are not given.
 
-        Few clips are soon learned by heart, so each is drawn a number of times; the bounds are for few and many clips.
+        Few clips are soon memorised, so each is drawn a number of times; the bounds are for few and many clips.
         """
 
         def steps(given: int, batch: int, epochs: int, most: int) -> int:
@@ -231,7 +231,7 @@ def finetuned(
             steps=tokenizer_steps,
             curriculum=(),
             optimizer=slower(own.optimizer, settings.tokenizer_learning_rate, tokenizer_steps),
-            flip=True,  # few recordings are soon learned by heart
+            flip=True,  # few recordings are soon memorised
             seed=settings.seed,
             early_stop=early_stop(patience or VALIDATIONS, tokenizer_steps),
         ),
@@ -254,7 +254,7 @@ def finetuned(
 
 
 def early_stop(patience: int, steps: int) -> EarlyStopConfig:
-    """Returns when a training of so many steps validates and stops."""
+    """Returns when a training of this many steps validates and stops."""
     return EarlyStopConfig(every=max(LEAST_BETWEEN, steps // VALIDATIONS), patience=patience)
 
 

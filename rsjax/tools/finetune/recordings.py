@@ -48,7 +48,7 @@ class Cutting:
         camera, option: as of ``rsjax ingest``.
         depth: likewise.
         delay: recorded frames by which commands act later than the format says; -1: measured on training episodes
-            (:mod:`rsjax.tools.finetune.delay`), or 0 if nobody says whether actions add up.
+            (:mod:`rsjax.tools.finetune.delay`), or 0 if it is unknown whether actions add up.
         test_share, validation_share: shares of the episodes.
         split_seed: chooses which episodes they are.
         workers: processes; -1: one per core.
@@ -167,7 +167,7 @@ def says_what_actions_are(episode: Episode) -> bool:
 
 
 def how_to_compose(episode: Episode, every: int) -> Compose:
-    """Returns how the actions of ``every`` recorded frames become one: joined, or stacked if nobody says how."""
+    """Returns how the actions of ``every`` recorded frames become one: joined, or stacked if it is unknown how."""
     config = ActionConfig()
     try:
         check_declared(ActionLayout.from_json(episode.meta.get("actions", {})), every, config)

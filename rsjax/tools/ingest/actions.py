@@ -111,7 +111,7 @@ def check_declared(layout: ActionLayout, skipped: int, config: ActionConfig) -> 
         problem = f"declared as steps, which add up, but {doubts}"
         cure = "say --option 'held=[…]' with the numbers of those that stay in force ('held=[]' if none does)"
         raise EpisodeError(f"actions: {problem}; {cure}", option="--option held")
-    problem = f"{skipped} recorded rows become one, and nobody says whether they are steps, which add up, or targets"
+    problem = f"{skipped} recorded rows become one, undeclared whether as steps, which add up, or as targets"
     cure = "say --option kind=delta or --option kind=absolute, and 'held=[…]' for grippers"
     if doubts:
         doubts = f"; these cannot be steps: {doubts}"

@@ -169,7 +169,7 @@ def _actions(episode: Episode) -> Iterator[Problem]:
         yield "action", "all are zero"
     layout = ActionLayout.from_json(episode.meta.get("actions", {}))
     for doubt in layout.unclear:
-        yield "action", f"{doubt}, so it is no step: declare kind and held"
+        yield "action", f"{doubt}, so it is not a step: declare kind and held"
     for first in layout.quaternions:
         lengths = np.linalg.norm(rows[:, first : first + 4], axis=1)
         if (off := np.flatnonzero(np.abs(lengths - 1) > _TOLERANCE)).size:

@@ -179,7 +179,7 @@ def lines(summary: IngestSummary) -> list[str]:
         " + ".join([f"windows   {sum(windows.values())} = {windows['kept']} kept", *_left_out(windows)]),
     ]
     if summary.cut:
-        text.append(f"cuts      in {summary.cut} episodes, which no window crosses; --shots none if they are none")
+        text.append(f"cuts      in {summary.cut} episodes, which no window crosses; --shots none if they are not cuts")
     if summary.test_clips == 0:
         # one episode is always for training
         cure = "raise --test-share"

@@ -33,7 +33,7 @@ def device_memory() -> int:
 
 def check_batch(config: Config, loop: TrainConfig, stage: Literal["tokenizer", "world_model"]) -> None:
     """Raises :class:`UserError` if a batch's activations cannot fit into the devices' memory."""
-    # At least so many bytes a clip for the backward pass: features of one layer, or inputs of blocks.
+    # At least this many bytes a clip for the backward pass: features of one layer, or inputs of blocks.
     if stage == "world_model":
         clip_bytes = config.clips.frames * _frame_bytes(config)
     elif config.autoencoder is config.tokenizer:
@@ -61,7 +61,7 @@ def _frame_bytes(config: Config) -> int:
 
 
 def check_together(config: Config, clips: int, frames: int, options: str) -> None:
-    """Raises :class:`UserError` if a world model cannot hold so many clips of so many frames in memory at once.
+    """Raises :class:`UserError` if a world model cannot hold this many clips of this many frames in memory at once.
 
     A generated clip that is longer than those of the training takes the memory of its window.
 

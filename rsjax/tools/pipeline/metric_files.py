@@ -87,7 +87,7 @@ def _annotator(settings: EvalConfig) -> Any:
         return None
     try:
         annotator = choose("depth", settings.depth_estimator)
-        require(callable(annotator), f"{settings.depth_estimator!r} is no network; choose one of docs/annotate.md")
+        require(callable(annotator), f"{settings.depth_estimator!r} is not a network; choose one of docs/annotate.md")
         for name, value in vars(annotator).items():
             require(not isinstance(value, Path) or value.exists(), f"{name} {value} does not exist; mend the path")
     except ConfigError as error:

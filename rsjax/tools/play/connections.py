@@ -12,7 +12,7 @@ SPARE = 64  # connections of pages without a session
 
 
 def most_connections(sessions: int) -> int:
-    """Returns the number of connections that a server with so many sessions keeps open at a time.
+    """Returns the number of connections that a server with this many sessions keeps open at a time.
 
     It leaves half of the process's file descriptors to files and to JAX.
     """

@@ -57,7 +57,7 @@ def read_picture(payload: bytes, side: int) -> Upload:
     """Decodes a PNG, JPEG or WebP picture, and cuts and scales it to a square.
 
     Raises:
-        Refused: the payload is no such picture, or the picture is damaged, too large or too small.
+        Refused: the payload is not such a picture, or the picture is damaged, too large or too small.
     """
     try:
         strict = warnings.catch_warnings(action="error", category=Image.DecompressionBombWarning)
@@ -70,7 +70,7 @@ def read_picture(payload: bytes, side: int) -> Upload:
     except Refused:
         raise
     except Exception as error:  # decoders raise all kinds of exceptions for damaged files
-        raise Refused("bad_image", "this is no PNG, JPEG or WebP picture that can be read") from error
+        raise Refused("bad_image", "this is not a PNG, JPEG or WebP picture that can be read") from error
     square = min(upright.size)
     middle = ImageOps.fit(upright, (square, square))
     if square == side:

@@ -102,7 +102,7 @@ def listen(host: str, port: int) -> socket.socket:
         family, _, _, _, where = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
         return socket.create_server(where[:2], family=family)
     except UnicodeError as error:  # too long, or of characters that no name can have
-        raise UserError(f"--host {host!r:.80}: is no name or address of a machine") from error
+        raise UserError(f"--host {host!r:.80}: is not a name or address of a machine") from error
     except OSError as error:
         raise UserError(
             f"--host {host} --port {port}: {error.strerror or error}; --port 0 takes a free port"

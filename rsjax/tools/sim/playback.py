@@ -52,10 +52,10 @@ def local_model(text: str) -> str:
     try:
         root = ElementTree.fromstring(text)
     except ElementTree.ParseError as error:
-        raise PlaybackError(f"the model is no XML ({error})") from error
+        raise PlaybackError(f"the model is not XML ({error})") from error
     package = importlib.util.find_spec("robosuite")
     if root.tag != "mujoco" or package is None or package.origin is None:
-        raise PlaybackError("robosuite is not installed" if root.tag == "mujoco" else "the model is no MJCF")
+        raise PlaybackError("robosuite is not installed" if root.tag == "mujoco" else "the model is not MJCF")
     assets = (Path(package.origin).parent / "models" / "assets").resolve()
     for element in root.iter():
         if element.tag in _REFUSED:
@@ -65,7 +65,7 @@ def local_model(text: str) -> str:
                 try:
                     first, second = (int(element.get(name, "1")) for name in pair)
                 except ValueError as error:
-                    raise PlaybackError(f"the model has a {element.tag} of a size that is no number") from error
+                    raise PlaybackError(f"the model has a {element.tag} of a size that is not a number") from error
                 if not 0 < first * second <= _MOST_PIXELS:
                     raise PlaybackError(f"the model has a {element.tag} of {first} × {second}")
         for name in _FOLDERS if element.tag == "compiler" else ():

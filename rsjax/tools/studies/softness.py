@@ -63,7 +63,7 @@ class Options:
 
 @dataclass(frozen=True)
 class ShareRight:
-    """The share of clips told right, and its 95 % interval over clips.
+    """The share of clips classified correctly, and its 95 % interval over clips.
 
     Attributes:
         lifted: the same over the clips in which the object leaves the table.

@@ -36,7 +36,7 @@ def test_a_target_is_hosts_with_devices(name: str, hosts: int, local: int, shape
     [
         ("h10", ["did you mean 'h100'", "rtx4090, rtx4090xN", "v5p-8 to -2048"]),
         ("h100x12", ["up to 8 cards", "'h100x8'"]),
-        ("v5e-7", ["no slice of TPU v5e", "v5e-1, v5e-4, v5e-8"]),
+        ("v5e-7", ["not a slice of TPU v5e", "v5e-1, v5e-4, v5e-8"]),
         ("h100x0", ["'h100x1'"]),
     ],
 )

@@ -72,7 +72,7 @@ def test_directories_and_indices_that_do_not_fit_are_refused(
     own = refused(capsys, "genie", tmp_path / "own", tmp_path / "o")
     assert "holds networks of this project; add --export to export one" in own
     file = refused(capsys, "genie", "--export", folder / "model.safetensors", tmp_path / "x.safetensors")
-    assert "is no directory made here, to export from; leave out --export to import a file" in file
+    assert "is not a directory made here, to export from; leave out --export to import a file" in file
     write_safetensors(folder / "diffusion_pytorch_model.safetensors", GENIE, {})
     assert "name one of them" in refused(capsys, "genie", folder, tmp_path / "o")
 

@@ -83,8 +83,8 @@ def test_an_estimator_is_known_by_the_content_of_its_files(tmp_path: Path) -> No
     ("word", "message"),
     [
         ("midas", "eval.depth_estimator: depth: no method 'midas'; choose"),
-        ("recorded", "eval.depth_estimator: 'recorded' is no network"),
-        ("none", "eval.depth_estimator: 'none' is no network"),
+        ("recorded", "eval.depth_estimator: 'recorded' is not a network"),
+        ("none", "eval.depth_estimator: 'none' is not a network"),
         ("depth-anything", "eval.depth_estimator: depth depth-anything: model missing; write"),
         ("depth-anything:model=nowhere", r"eval.depth_estimator: model .*/nowhere does not exist"),
     ],

@@ -33,8 +33,8 @@ def scene(asset: str = "", more: str = "") -> str:
         (scene(more='<include file="/etc/passwd"/>'), "an element 'include'"),
         (scene().replace("<asset>", '<extension><plugin plugin="x"/></extension><asset>'), "an element 'extension'"),
         ('<!DOCTYPE x [<!ENTITY a "a">]><mujoco/>', "declares entities"),
-        ("<mujoco>", "no XML"),
-        ("<robot/>", "no MJCF"),
+        ("<mujoco>", "not XML"),
+        ("<robot/>", "not MJCF"),
     ],
 )
 def test_a_model_loads_nothing_but_robosuites_own_files(text: str, message: str) -> None:

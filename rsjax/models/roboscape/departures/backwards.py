@@ -1,6 +1,6 @@
 """Some training clips run backwards, with the actions that lead back, so that few clips show more motions.
 
-In few recordings, a scene's first frame nearly tells what the robot will do there, and a model learns that by heart
+In few recordings, a scene's first frame nearly says what the robot will do there, and a model memorises that
 instead of following the actions. A clip that runs backwards begins where the other ends, and undoes its motion. Robots
 move both ways; what falls or breaks does not, so this is for data in which the robot's own motion matters most.
 """
@@ -31,7 +31,7 @@ def undoing(actions: Float[np.ndarray, "T A"], held: tuple[int, ...]) -> Float[n
     If a step a led from one frame into the next, -a leads back. What is held in frame t is so in that frame.
 
     Args:
-        held: dimensions that are no steps.
+        held: dimensions that are not steps.
     """
     back = np.zeros_like(actions)
     back[1:] = -actions[:0:-1]

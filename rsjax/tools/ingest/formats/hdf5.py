@@ -102,7 +102,7 @@ class H5Frames:
         with open_file(path) as file:
             data = member(file, key, path)
             if not isinstance(data, h5py.Dataset) or data.shape is None:
-                raise EpisodeError.at(path, f"{key} is no array", f"render it again or {LEAVE_OUT}")
+                raise EpisodeError.at(path, f"{key} is not an array", f"render it again or {LEAVE_OUT}")
             shape = data.shape
             kind = data.dtype
         if depth:

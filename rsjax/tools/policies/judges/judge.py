@@ -43,7 +43,7 @@ def of_single_frames(judge: Judge) -> Judge:
 def all_successes(verdicts: Float[np.ndarray, "n B 3"]) -> Float[np.ndarray, "B 3"]:
     """Returns the last of n verdicts in a row, with the least of their probabilities of success; failure is the rest.
 
-    So a single frame that looks like success is no success.
+    So a single frame that looks like success is not a success yet.
     """
     last = verdicts[-1].copy()
     least = verdicts[..., SUCCESS].min(axis=0)

@@ -135,7 +135,7 @@ def load_judge(folder: Path, side: int | None = None) -> TrainedJudge:
             raise ValueError(f"{first} is {present.get(first, 'missing')}, not {wanted.get(first, 'there')}")
         for name, x in record.items():
             if not isinstance(x, np.ndarray) or x.dtype.kind != "f" or not np.isfinite(x).all():
-                raise ValueError(f"{name} is no array of finite floats")
+                raise ValueError(f"{name} is not an array of finite floats")
     except FileNotFoundError as error:
         raise UserError(f"{path}: no judge there; train one with rsjax judge RUN") from error
     except (OSError, ValueError, KeyError, TypeError, OverflowError) as error:

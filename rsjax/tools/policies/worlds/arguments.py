@@ -13,7 +13,7 @@ def checked_count(name: str, count: object, most: int) -> int:
     """Returns a whole number from 1 to ``most``.
 
     Raises:
-        UserError: it is none.
+        UserError: it is not.
     """
     if isinstance(count, bool) or not isinstance(count, int | np.integer) or not 1 <= count <= most:
         raise UserError(f"{name} is {count!r:.80}; it is a whole number from 1 to {most}")

@@ -140,5 +140,5 @@ class Starts:
 
 
 def _is_whole(value: Any) -> bool:
-    """Returns whether a value is a whole number; True and False are none."""
+    """Returns whether a value is a whole number; True and False are not."""
     return isinstance(value, int | np.integer) and not isinstance(value, bool)

@@ -187,5 +187,5 @@ def _scored(finished: Sequence[RunResult], source: str, score: str, metric: str,
 
 
 def rounded(value: float | None, digits: int) -> float | None:
-    """Returns a number with so many significant digits; NaN stays NaN and None stays None."""
+    """Returns a number with this many significant digits; NaN stays NaN and None stays None."""
     return value if value is None or math.isnan(value) else float(f"{value:.{digits}g}")

@@ -74,7 +74,7 @@ def parse_duration(text: str, option: str = "--budget") -> float:
         option: where it was given, for the error.
 
     Raises:
-        ConfigError: the text is no duration above 0.
+        ConfigError: the text is not a duration above 0.
     """
     text = text.strip()
     terms = list(_TERM.finditer(text))

@@ -126,7 +126,7 @@ class Claim:
         require(len(set(names)) == len(names), f"claim {self.name!r} has two arms of one name; rename one of them")
         for comparison in self.comparisons:
             for name in (comparison.better, comparison.than):
-                require(name in names, f"claim {self.name!r} compares {name!r}, which is none of its arms")
+                require(name in names, f"claim {self.name!r} compares {name!r}, which is not one of its arms")
 
     @property
     def equal(self) -> Literal["steps", "seconds", "flops"]:

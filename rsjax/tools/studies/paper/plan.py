@@ -139,7 +139,7 @@ def _new_seconds(config: Config, keys: Mapping[str, str], made: set[str]) -> flo
         "depth_estimator": budget.depth_estimator_seconds,
         "annotations": budget.annotation_seconds,
     }
-    # Copies with estimated annotations are no stage; all world models on them share them.
+    # Copies with estimated annotations are not a stage; all world models on them share them.
     copies = [part.annotations for stage in config.train.curriculum for part in stage.components]
     keys = {**keys, "annotations": " ".join([keys["tokens"], *copies])}
     new = [stage for stage in parts if stage in keys and keys[stage] not in made]

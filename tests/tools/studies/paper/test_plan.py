@@ -276,7 +276,7 @@ def test_an_arm_that_cannot_be_trained_is_absent_with_its_reason(capsys: pytest.
 
 
 def test_claims_name_their_arms_and_are_chosen_by_name() -> None:
-    with pytest.raises(ConfigError, match="compares 'none', which is none of its arms"):
+    with pytest.raises(ConfigError, match="compares 'none', which is not one of its arms"):
         toy.claim("toy", ArmComparison("psnr", "with", "none"))
     with pytest.raises(ConfigError, match=r"--only tabel1: no such claim; did you mean 'table1'\? \(claims: table2"):
         chosen(["tabel1"], claims())

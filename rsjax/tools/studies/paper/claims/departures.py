@@ -75,7 +75,7 @@ _departure(
 _departure(
     "moved-copies",
     "Moved copies of the training clips",
-    "A scene that is moved by less than a token has other tokens everywhere, so few clips are not learned by heart.",
+    "A scene that is moved by less than a token has other tokens everywhere, so few clips are not memorised.",
     {"model.departures.shifts": 0},
     _METRICS,
 )
