@@ -214,7 +214,7 @@ OPTIONS = {
     "train debug --model.depth small_branch --model.depth.cells 5": "model.depth.cells is 5, which does not divide",
     "train debug --model.depth headed": "--model.depth is 'headed'; choose branch or small_branch or head or none",
     "train debug --processes 2 --process-id 0 --coordinator host:²": "--coordinator is",
-    "train debug --profile -1": "profile",
+    "train debug --runtime.profile -1": "runtime.profile is -1; it must be at least 0",
     "ablation debug --seeds -1": "--seeds is -1",
     "ablation debug --seeds 0 99999999999999999999": "seed",
     "generate RUN --fps 0.001": "--fps is 0.001",
@@ -246,7 +246,9 @@ OPTIONS = {
 @pytest.mark.parametrize("line", OPTIONS)
 def test_an_impossible_option_is_named(line: str, place: Path, command: Command) -> None:
     run = "RUN --store STORE --out PLACE/out"
-    assert_clear(command(filled(line.replace("RUN", run), place)), OPTIONS[line])
+    answer = command(filled(line.replace("RUN", run), place))
+    assert_clear(answer, OPTIONS[line])
+    assert "unknown argument" not in answer[2]
 
 
 OUTPUTS = (
