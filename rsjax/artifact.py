@@ -40,7 +40,7 @@ class OtherKeyError(UserError):
 
 @dataclass(frozen=True)
 class Mark:
-    """What a folder says about its content.
+    """A folder's record of its content.
 
     Attributes:
         key: the content key it is made under.

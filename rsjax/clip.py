@@ -70,7 +70,7 @@ class Video:
 
     @property
     def has_depth(self) -> Bool[np.ndarray, " B"]:
-        """Which clips have depth."""
+        """A mask of the clips that have depth."""
         if self.depth is None:
             return np.zeros(len(self.rgb), bool)
         return ~np.isnan(self.depth[:, :1]).any(axis=(1, 2, 3))

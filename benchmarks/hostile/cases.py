@@ -22,7 +22,7 @@ class Began(BaseException):
 
 
 class Ended(NamedTuple):
-    """How an input ended.
+    """The end of a case.
 
     Attributes:
         kind: refused with a message; ended without one; began to work; broke with a traceback; or unclear.

@@ -33,7 +33,7 @@ _FIELDS = (*_ONE_VIEW, "episode", "fps", *_LABELS)
 
 @dataclasses.dataclass
 class _Episode:
-    """What the manifest records about the clips of one episode."""
+    """The manifest's record of the clips of one episode."""
 
     numbers: list[int] = dataclasses.field(default_factory=list)
     statistics: Statistics | None = None

@@ -49,7 +49,7 @@ class CorrectedRate:
 
     @property
     def saved(self) -> float:
-        """How many trials in the true world the model saves; below 0 if a fixed weight makes the interval wider."""
+        """The trials in the true world that the model saves; below 0 if a fixed weight makes the interval wider."""
         return self.worth - self.trials
 
 

@@ -15,7 +15,7 @@ SAMPLING = ("steps", "temperature", "top_k", "unmask", "mean_codes", "guidance")
 
 @dataclass(frozen=True)
 class Protocol:
-    """What is generated, and which of its frames are scored.
+    """The settings of an evaluation: what is generated, and which of its frames are scored.
 
     Attributes:
         name: one of :data:`PROTOCOLS`, or "run".
@@ -86,7 +86,7 @@ class Protocol:
 
     @property
     def depth_suffix(self) -> str:
-        """What follows ``depth_absrel`` in the names of the depth scores that tables show."""
+        """The suffix after ``depth_absrel`` in the names of the depth scores that tables show."""
         return "" if self.depth_alignment == "none" else f"_{self.depth_alignment}_{self.depth_source}"
 
     def described(self) -> dict[str, Any]:

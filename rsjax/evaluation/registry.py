@@ -47,7 +47,7 @@ class EstimatedDepth:
 
 @dataclass(frozen=True)
 class Places:
-    """Where cube and gripper are in the last frames of B clips, or in any frames.
+    """The places of cube and gripper in the last frames of B clips, or in any frames.
 
     Attributes:
         xy: x (right) and y (down) of cube and gripper; 0 and 1 are the image's edges, and points outside are clipped.
@@ -122,7 +122,7 @@ class Drives:
 
 @dataclass(frozen=True)
 class Probed:
-    """What became of simulated probes in a scene."""
+    """The outcomes of simulated probes in a scene."""
 
     grasps: Grasps
     drives: Drives
@@ -133,7 +133,7 @@ NO_PROBES = Unavailable("no grasps and drives were simulated for this evaluation
 
 @dataclass(frozen=True)
 class Familiarity:
-    """How far B clips' states and actions are from the training clips (:mod:`rsjax.evaluation.coverage`).
+    """The distances of B clips' states and actions from the training clips (:mod:`rsjax.evaluation.coverage`).
 
     Attributes:
         coverage: the distance, where 1 is that of the median training clip from the others.

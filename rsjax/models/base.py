@@ -45,7 +45,7 @@ class Assets:
 
 @dataclass(frozen=True)
 class TeacherForced:
-    """How well a model predicts the tokens of single frames from all true frames before them.
+    """The scores of a model that predicts each frame's tokens from all true frames before it.
 
     Attributes:
         cross_entropy: mean over a frame's cells of -log p of their tokens in nats (the sum over vocabularies), by

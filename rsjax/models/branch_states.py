@@ -12,7 +12,7 @@ from rsjax.clip import Video
 
 @dataclass(frozen=True)
 class Decoding:
-    """How one frame is decoded.
+    """The settings with which one frame is decoded.
 
     Attributes:
         steps, temperature, guidance, top_k: as in :class:`rsjax.config.SampleConfig`.

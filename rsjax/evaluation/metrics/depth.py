@@ -32,7 +32,7 @@ _MIN_L1_SCALE = 1e-3
 
 @dataclass(frozen=True)
 class DepthProtocol:
-    """Which pixels count, and how they are averaged.
+    """A rule for which pixels count and how they are averaged.
 
     Attributes:
         min_truth: only pixels with a true depth strictly above this count.

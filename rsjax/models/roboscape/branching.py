@@ -36,7 +36,7 @@ from rsjax.trainable import Params
 
 @dataclass(frozen=True)
 class _Memory:
-    """What a clip continues from.
+    """The memory from which a clip continues.
 
     Attributes:
         state: of one clip, without its cache.

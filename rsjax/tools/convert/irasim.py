@@ -39,7 +39,7 @@ Conditioning = Literal["frame", "video"]
 
 
 class Variant(NamedTuple):
-    """What a file's tensors do not reveal.
+    """The settings that a file's tensors do not reveal.
 
     Attributes:
         heads: attention heads; None: those of the public sizes.

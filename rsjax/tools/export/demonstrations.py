@@ -28,7 +28,7 @@ MOST_FAILURES = 5  # episodes in a row; more mean a broken installation
 
 @dataclass(frozen=True)
 class DemonstrationOptions:
-    """Which demonstrations are simulated, and how they are written.
+    """The options of simulated demonstrations, and of how they are written.
 
     Attributes:
         demos: demonstrations; the tasks take turns.

@@ -46,7 +46,7 @@ MOST_PADDING = 0.25  # share of action targets that is acceptable
 
 @dataclass(frozen=True)
 class LeRobotOptions:
-    """How a store is exported.
+    """The options of an export.
 
     Attributes:
         version: version of the format; v3.0 for LeRobot 0.4 and later, v2.1 for earlier ones and openpi.

@@ -23,7 +23,7 @@ COMPILING = 120.0  # seconds, of all programs together
 
 @dataclass(frozen=True)
 class Cost:
-    """What the trainings of a run cost.
+    """The cost of a run's trainings.
 
     Attributes:
         tokenizer, world_model: floating-point operations of all steps.

@@ -31,7 +31,7 @@ MARGIN = 0.07  # by which they have to explain more than as recorded; in simulat
 
 @dataclass(frozen=True)
 class Delay:
-    """How late commands act.
+    """The delay with which commands act.
 
     Attributes:
         explained: the share of the motion's variance that commands explain if they act 0, 1, 2, … recorded frames late;

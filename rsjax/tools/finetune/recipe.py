@@ -109,7 +109,7 @@ class Finetuning:
 
 @dataclass(frozen=True)
 class ReconstructionScores:
-    """How well a tokenizer reconstructs held-out frames of the recordings, in dB of PSNR.
+    """The PSNR, in dB, of held-out frames of the recordings that a tokenizer reconstructs.
 
     Attributes:
         psnr: of the tokenizer.

@@ -28,7 +28,7 @@ MOST_CLIPS = 4000  # about; with more, clips overlap less
 
 @dataclass(frozen=True)
 class Recordings:
-    """What to fine-tune on.
+    """The recordings to fine-tune on.
 
     Attributes:
         source: a format of ``rsjax ingest``; "" if ``path`` is a store of clips.
@@ -41,7 +41,7 @@ class Recordings:
 
 @dataclass(frozen=True)
 class Cutting:
-    """How recordings become clips, as far as a user chose it.
+    """The user's choices of how recordings become clips.
 
     Attributes:
         frames, rate: of a clip; 0: chosen by the recordings.

@@ -61,7 +61,7 @@ class ActionLayout:
 
 @dataclass(frozen=True)
 class ActionConfig:
-    """How a source's actions become the actions of clips.
+    """The settings by which a source's actions become the actions of clips.
 
     Attributes:
         offset: frames by which this source recorded its commands too early (> 0) or too late (< 0), in addition to its
@@ -252,7 +252,7 @@ def _product(left: Float64[np.ndarray, "*N 4"], right: Float64[np.ndarray, "*N 4
 
 
 class Declared(NamedTuple):
-    """What a data set or its user declares about actions, as arguments of :func:`layout_of`; None: nothing."""
+    """The declarations of a data set or its user about actions, as arguments of :func:`layout_of`; None: nothing."""
 
     kind: Kind | None
     held: tuple[int, ...] | None

@@ -53,7 +53,7 @@ _UNEVEN = 1e-3  # seconds by which frame intervals may differ from the frame rat
 
 @dataclass(frozen=True)
 class ClipConfig:
-    """How clips are cut."""
+    """The settings by which clips are cut."""
 
     windows: WindowConfig = field(default_factory=WindowConfig)  # which frames make a clip
     image_size: int = 64  # pixels

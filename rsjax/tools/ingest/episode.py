@@ -120,7 +120,7 @@ class Depths(Protocol):
 
 @dataclass(frozen=True)
 class EpisodeRef:
-    """Where an episode is. Can be pickled and written as JSON: it travels to worker processes.
+    """The place of an episode. It can be pickled and written as JSON, as it travels to worker processes.
 
     Attributes:
         id: unique within the source, safe as a file name (see :func:`rsjax.files.safe_id`).

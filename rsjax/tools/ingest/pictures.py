@@ -195,7 +195,7 @@ def _bytes(path: Path) -> bytes:
 
 @dataclass(frozen=True)
 class Placement:
-    """Where a recorded picture lies in the square: position x of the picture is ``scale * x + offset`` of the square.
+    """The place of a recorded picture in the square: position x of the picture is ``scale * x + offset`` of the square.
 
     Attributes:
         scale: for x and y; 0 and 1 are the outer edges of the picture and of the square.

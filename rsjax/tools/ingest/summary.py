@@ -23,7 +23,7 @@ _ROW = ("episode", "stage", "key", "error", "option", "traceback")
 
 @dataclass(frozen=True)
 class IngestSummary:
-    """What became of every episode (episodes = done + filtered + quarantined) and of every window.
+    """The outcome of every episode (episodes = done + filtered + quarantined) and of every window.
 
     Attributes:
         episodes: how many the source lists.

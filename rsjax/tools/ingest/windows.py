@@ -25,7 +25,7 @@ Span = tuple[int, int]  # first frame, and the one after the last
 
 @dataclass(frozen=True)
 class WindowConfig:
-    """How episodes are cut, and which windows are kept.
+    """The settings by which episodes are cut and windows are kept.
 
     Motion is ``rsjax.tools.ingest.annotators.protocols.Motion.high``, in pixels per second of a 256-pixel-wide picture.
     """

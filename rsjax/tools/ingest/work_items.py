@@ -73,7 +73,7 @@ ALL_TRAIN_BUT_A_TENTH = SplitShares()
 
 @dataclass(frozen=True)
 class IngestPlan:
-    """What is ingested, how, and into which store. Picklable.
+    """The episodes, steps and store of an ingest. Picklable.
 
     Attributes:
         source: the episodes.

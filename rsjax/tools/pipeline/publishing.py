@@ -29,7 +29,7 @@ ROWS = {"": "prediction", "_repeat_first": "first frame repeated", "_tokenizer":
 
 @dataclass(frozen=True)
 class Publication:
-    """What a saved model holds, beside its weights.
+    """The content of a saved model beside its weights.
 
     Attributes:
         dtype: of the weights.

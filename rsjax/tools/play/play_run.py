@@ -66,7 +66,7 @@ class PlayRun:
 
     @cached_property
     def missing(self) -> str:
-        """Why there are no clips; "" if there are some."""
+        """The reason why there are no clips; "" if there are some."""
         try:
             store = self.data.clips
         except UserError as error:

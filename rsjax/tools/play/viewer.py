@@ -128,7 +128,7 @@ class Viewer:
 
     @property
     def no_truth(self) -> str:
-        """Why no simulator can run beside sessions; "" if one can."""
+        """The reason why no simulator can run beside sessions; "" if one can."""
         if self._truths.make:
             return ""
         return "the clips are of no simulator that is here"

@@ -61,7 +61,7 @@ class Simulator(Protocol):
 
 
 class Manner(Protocol):
-    """What an episode's scripted policy was drawn to do, as a dataclass; ``mode`` names the kind."""
+    """The drawn behaviour of an episode's scripted policy, as a dataclass; ``mode`` names its kind."""
 
     @property
     def mode(self) -> str: ...

@@ -21,7 +21,7 @@ TURN_GAIN = 1.5  # action per radian
 
 @dataclass(frozen=True)
 class ArmState:
-    """What every expert of the Panda arm observes: positions in metres in the world, yaws in radians.
+    """The observation of every expert of the Panda arm: positions in metres in the world, yaws in radians.
 
     Attributes:
         gripper: position of the gripper.

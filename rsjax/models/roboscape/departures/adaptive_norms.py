@@ -18,7 +18,7 @@ from rsjax.layers.parameters import Norm
 
 @struct.dataclass
 class Change:
-    """What a frame's action makes of one layer f of a block: x += (1 + gate)·f(norm(x)·(1 + scale) + shift).
+    """An action's change of one layer f of a block: x += (1 + gate)·f(norm(x)·(1 + scale) + shift).
 
     A layer without a norm before it has neither scale nor shift.
     """

@@ -115,7 +115,7 @@ class DepthMaps:
 
 @dataclass(frozen=True)
 class Semantic:
-    """What happens in one part of an episode.
+    """A description of one part of an episode.
 
     Attributes:
         start: first frame.
@@ -138,7 +138,7 @@ class Semantic:
 
 @dataclass(frozen=True)
 class Semantics:
-    """What an episode is about.
+    """A description of a whole episode.
 
     Attributes:
         task: the task of the whole episode; "" if unknown.

@@ -78,7 +78,7 @@ _MOST_BYTES = 2**28  # largest size of a text table
 
 @dataclass(frozen=True)
 class FolderConfig:
-    """What ``dataset.json`` and the options say about all episodes.
+    """The settings of ``dataset.json`` and the options, for all episodes.
 
     Attributes:
         task: the task of episodes that name none; None (null in JSON) means no task.

@@ -86,7 +86,7 @@ class Adaptation:
 
 @dataclass(frozen=True)
 class Behaviour:
-    """What the model is adapted to: policies in the simulator, recorded episodes, or both.
+    """The data that the model is adapted to: policies in the simulator, recorded episodes, or both.
 
     Attributes:
         policies: by name; measured in the simulator and in the models. Without ``episodes`` the model learns from them.

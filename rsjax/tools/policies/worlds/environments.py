@@ -98,7 +98,7 @@ class EnvironmentSettings:
 
 
 class _Model:
-    """What both environments of a world model need: its world, first frames and spaces."""
+    """The parts that both environments of a world model need: its world, first frames and spaces."""
 
     def __init__(
         self,
@@ -463,7 +463,7 @@ class LiftEnv(gymnasium.Env[Any, Any]):
 
     @property
     def state(self) -> LiftState:
-        """Where gripper and cube are, for scripted policies."""
+        """The places of gripper and cube, for scripted policies."""
         state: LiftState = self._world.simulators[0].state
         return state
 

@@ -28,7 +28,7 @@ DRAWS = 2**20  # added to a clip's index at each step, so that steps differ in t
 
 @dataclass(frozen=True)
 class FirstFrame:
-    """Where an episode in a world model begins.
+    """The first frame of an episode in a world model.
 
     Attributes:
         rgb: the first frame.

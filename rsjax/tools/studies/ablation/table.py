@@ -42,7 +42,7 @@ class Row:
 
     @property
     def reasons(self) -> dict[str, str]:
-        """Why a result of the row has no number for a metric, by name."""
+        """The reasons why results of the row have no number for a metric, by name."""
         return {name: reason for result in self.results for name, reason in result.reasons.items()}
 
 

@@ -36,7 +36,7 @@ class ScoreRows:
 
 @dataclass(frozen=True)
 class ArmScores:
-    """What was measured of an arm.
+    """The measured scores of an arm.
 
     Attributes:
         name: the arm's name.

@@ -130,7 +130,7 @@ class Claim:
 
     @property
     def equal(self) -> Literal["steps", "seconds", "flops"]:
-        """What the trainings of its arms have in common: steps, unless an arm has equal seconds or operations."""
+        """What is equal in the trainings of its arms: steps, unless an arm has equal seconds or operations."""
         return next((arm.equal for arm in self.arms if arm.equal != "steps"), "steps")
 
     def arm(self, name: str) -> Arm:
