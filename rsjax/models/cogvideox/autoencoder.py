@@ -26,7 +26,7 @@ from rsjax.devices import divide
 from rsjax.models.cogvideox import causal_vae as vae
 from rsjax.models.cogvideox.config import COMPRESSION, CausalVAEConfig, CogVideoXConfig, padded_frames
 from rsjax.models.diffusion import latents as distributions
-from rsjax.models.saved import check_alike, read_model
+from rsjax.models.network_settings import check_alike, read_model
 from rsjax.tokenizers.codec import images_per_pass, in_chunks
 from rsjax.tokenizers.flops import traced_flops
 from rsjax.tokenizers.training import require_no_adversarial

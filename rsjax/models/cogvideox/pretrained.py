@@ -9,7 +9,7 @@ from flax.traverse_util import flatten_dict, unflatten_dict
 from rsjax.errors import UserError
 from rsjax.models.cogvideox.config import CogVideoXConfig
 from rsjax.models.cogvideox.transformer import Architecture, shapes
-from rsjax.models.saved import check_alike, read_model
+from rsjax.models.network_settings import check_alike, read_model
 from rsjax.progress import note
 from rsjax.trainable import Params
 

@@ -16,7 +16,7 @@ from rsjax.errors import UserError
 from rsjax.model_directory import Part, has_weights, read_settings
 from rsjax.models.irasim.config import IRASimConfig, KLConfig
 from rsjax.models.irasim.dit import Architecture, architecture
-from rsjax.models.saved import check_family
+from rsjax.models.network_settings import check_family
 from rsjax.progress import note
 from rsjax.trainable import Params
 

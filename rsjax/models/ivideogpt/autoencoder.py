@@ -27,7 +27,7 @@ from rsjax.devices import divide
 from rsjax.errors import UserError
 from rsjax.models.ivideogpt.conditional_vq import ConditionalVQ, Reconstruction
 from rsjax.models.ivideogpt.config import ConditionalVQConfig, IVideoGPTConfig
-from rsjax.models.saved import check_alike, read_model, saved_inputs
+from rsjax.models.network_settings import check_alike, read_model, saved_inputs
 from rsjax.tokenizers.autoencoder import Autoencoder
 from rsjax.tokenizers.codec import each_pass, images_per_pass
 from rsjax.tokenizers.flops import traced_flops

@@ -27,7 +27,7 @@ from rsjax.models.ivideogpt.config import IVideoGPTConfig
 from rsjax.models.ivideogpt.llama import Architecture, LLaMA, empty_cache, folded
 from rsjax.models.ivideogpt.rollout import generate
 from rsjax.models.ivideogpt.sequence import Layout
-from rsjax.models.saved import check_alike, read_model, saved_inputs
+from rsjax.models.network_settings import check_alike, read_model, saved_inputs
 from rsjax.tokenizers.autoencoder import Autoencoder
 from rsjax.tokenizers.tokenize import described, prepare_store
 from rsjax.trainable import Params, StepContext, Term

@@ -15,10 +15,10 @@ from rsjax.config import Config, ConfigError, Departures, GenieConfig, RoboScape
 from rsjax.config.fields import differences
 from rsjax.errors import UserError
 from rsjax.model_directory import has_weights, read_settings
+from rsjax.models.network_settings import check_family
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.departures.second_view import SECOND
 from rsjax.models.roboscape.transformer import Transformer
-from rsjax.models.saved import check_family
 from rsjax.trainable import Params
 
 # Departures in which the saved network and the one to train must agree; other departures may differ.

@@ -28,7 +28,7 @@ from rsjax.models.cogvideox.pretrained import saved_architecture
 from rsjax.models.cogvideox.text import EMPTY, write_texts
 from rsjax.models.cogvideox.transformer import shapes
 from rsjax.models.diffusion.config import NoiseConfig
-from rsjax.models.saved import Inputs, read_model
+from rsjax.models.network_settings import Inputs, read_model
 from rsjax.tools.convert.directory import save_part, saved_part
 from rsjax.tools.convert.files import (
     REPLACES,

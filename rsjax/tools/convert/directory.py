@@ -13,10 +13,10 @@ from rsjax.files import disk_guard, read_json, write_json
 from rsjax.model_directory import Part, has_weights, load_part
 from rsjax.models.irasim import autoencoder, dit, pretrained
 from rsjax.models.irasim.config import KLConfig
+from rsjax.models.network_settings import Inputs, read_model, saved_inputs
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.pretrained import read_architecture
 from rsjax.models.roboscape.transformer import Transformer
-from rsjax.models.saved import Inputs, read_model, saved_inputs
 from rsjax.tokenizers.magvit2 import Tokenizer
 from rsjax.tokenizers.training import read_tokenizer_config
 from rsjax.tools.convert.files import ConvertError

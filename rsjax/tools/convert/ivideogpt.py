@@ -22,7 +22,7 @@ from rsjax.models.ivideogpt.conditional_vq import ConditionalVQ
 from rsjax.models.ivideogpt.config import ConditionalVQConfig, IVideoGPTConfig
 from rsjax.models.ivideogpt.llama import Architecture, LLaMA
 from rsjax.models.ivideogpt.sequence import Layout
-from rsjax.models.saved import Inputs, read_model, saved_inputs
+from rsjax.models.network_settings import Inputs, read_model, saved_inputs
 from rsjax.tools.convert.directory import save_part, saved_part
 from rsjax.tools.convert.files import (
     REPLACES,

@@ -16,7 +16,7 @@ from rsjax.models.cogvideox.config import CausalVAEConfig, CogVideoXConfig, Text
 from rsjax.models.cogvideox.pretrained import completed, saved_architecture
 from rsjax.models.cogvideox.text import read_texts
 from rsjax.models.cogvideox.transformer import shapes
-from rsjax.models.saved import read_model
+from rsjax.models.network_settings import read_model
 from rsjax.tools.convert import cogvideox
 from rsjax.tools.convert.files import Tensors, write_safetensors
 from rsjax.tools.convert.table import to_tensors

@@ -12,7 +12,7 @@ from rsjax.config import ClipShape
 from rsjax.models.ivideogpt.config import ConditionalVQConfig, IVideoGPTConfig
 from rsjax.models.ivideogpt.llama import Architecture, LLaMA
 from rsjax.models.ivideogpt.model import IVideoGPT
-from rsjax.models.saved import Inputs
+from rsjax.models.network_settings import Inputs
 from rsjax.tools.convert.directory import save_part
 from rsjax.tools.convert.files import write_safetensors
 from rsjax.tools.convert.ivideogpt import llama_table, tokenizer_shapes, tokenizer_table

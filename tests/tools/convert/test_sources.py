@@ -8,7 +8,7 @@ import pytest
 
 from rsjax.models.cogvideox.config import CogVideoXConfig
 from rsjax.models.ivideogpt.config import IVideoGPTConfig
-from rsjax.models.saved import read_model
+from rsjax.models.network_settings import read_model
 from rsjax.tools.convert import cogvideox
 from rsjax.tools.convert.directory import load_world_model
 from rsjax.tools.convert.files import Tensors, write_safetensors
