@@ -79,7 +79,8 @@ def kernel_flops(name: str, operands: Shapes, results: Shapes) -> int:
     if name in PRODUCTS:
         weights, count = PRODUCTS[name]
         return products(operands[0], operands[weights], count)
-    log_sum = results[1]
     if name.endswith("backward"):
         log_sum = operands[3]
+    else:
+        log_sum = results[1]
     return attention(operands[0], log_sum, *ATTENTION[name])
