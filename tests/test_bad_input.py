@@ -229,6 +229,8 @@ OPTIONS = {
     "ingest sim STORE --test-share nan": "--test-share is nan",
     "play PLACE --no-browser": "not a run directory",
     "describe debug --train.seed -1": "train.seed is -1",
+    "detect": "name videos or stores to judge, or runs to --train on",
+    "detect a.mp4 --train runs/tiny": "name videos or stores to judge, or runs to --train on",
     "bench debug --train.seed -1": "train.seed is -1",
     "train debug --run-dir PLACE/new --eval.action-draws 99999999": "lower --eval.clips, --eval.rep",
     "train debug --eval.localiser-steps 99999999": "eval.localiser_steps is 99999999; it must be 1 … 100000",

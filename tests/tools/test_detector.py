@@ -1,6 +1,5 @@
 """Tests of the detector of generated video, on toy videos: detailed ones are real, blurred ones generated."""
 
-import sys
 from pathlib import Path
 
 import cv2
@@ -11,7 +10,6 @@ from jaxtyping import UInt8
 import rsjax
 from rsjax.clip import GENERATED, GENERATED_MARK
 from rsjax.errors import UserError
-from rsjax.tools.commands.detect import main
 from rsjax.tools.detector.judging import judged
 from rsjax.tools.detector.spectra import FEATURES, RINGS, SHIPPED, Detector, load_detector, video_features
 from rsjax.tools.detector.training import AS_IT_IS, LEARNED, TREATMENTS, RunFeatures, measure, scores, tables, train
@@ -80,7 +78,7 @@ def test_a_saved_detector_is_the_same_and_damage_is_noticed(detector: Detector, 
     assert "SHA-256" in str(damaged.value)
     with pytest.raises(UserError) as missing:
         load_detector(tmp_path / "nowhere")
-    assert "no detector there" in str(missing.value)
+    assert "missing; train it again with rsjax detect" in str(missing.value)
 
 
 def test_the_detector_of_the_package_knows_the_packages_clips_as_recorded() -> None:
@@ -123,14 +121,3 @@ def test_each_run_is_tested_with_its_clips_left_out() -> None:
     assert len(tables(rows)["treatments"].rows) == len(TREATMENTS) and set(LEARNED) < set(TREATMENTS)
     with pytest.raises(UserError):
         measure(footage[1:])
-
-
-def test_the_command_wants_either_videos_or_runs(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    for words in ([], ["a.mp4", "--train", "runs/tiny"]):
-        monkeypatch.setattr(sys, "argv", ["rsjax detect", *words])
-        with pytest.raises(SystemExit):
-            main()
-        assert "name videos or stores to judge, or runs to --train on" in capsys.readouterr().err
