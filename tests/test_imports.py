@@ -50,6 +50,23 @@ def test_tokenizers_import_no_model() -> None:
     assert not [name for name, path in tokenizers.items() if any("models" in one for one in imported(path, known))]
 
 
+def family_of(module: str) -> str:
+    """Returns the family of world models that a module belongs to; "" if it belongs to none."""
+    parts = module.split(".")
+    is_family = (
+        parts[:2] == ["rsjax", "models"] and len(parts) > 2 and (ROOT.joinpath(*parts[:3]) / "model.py").exists()
+    )
+    return parts[2] if is_family else ""
+
+
+def test_no_family_of_models_imports_another() -> None:
+    """What families share is in ``models/diffusion``; only Genie is a special case of another, RoboScape."""
+    known = modules()
+    pairs = {(family_of(name), family_of(target)) for name, path in known.items() for target in imported(path, known)}
+    assert ("roboscape", "roboscape") in pairs
+    assert {(own, other) for own, other in pairs if own and other and own != other} == {("genie", "roboscape")}
+
+
 def test_an_installation_holds_every_module() -> None:
     """Setuptools leaves out a folder without ``__init__.py``, with all folders in it."""
     folders = {path.parent for path in (ROOT / "rsjax").rglob("*.py")}
