@@ -50,7 +50,7 @@ class TokenImagination:
 
     Args:
         clips: their number.
-        depth: False: depth is generated, since later frames depend on it, but not decoded to metres.
+        depth: False: if the network predicts depth, since later frames depend on it, it is not decoded to metres.
 
     Raises:
         ConfigError: the model does not support these sampling settings.

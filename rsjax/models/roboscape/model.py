@@ -218,7 +218,8 @@ class RoboScape(WorldModel[Batch]):
         return self._video(assets, made, np.repeat(has_depth & depth, candidates), prompt, tokens)
 
     def imagine(self, params: Params, assets: Assets, clips: int, depth: bool = True) -> TokenImagination:
-        return TokenImagination(self.config, self.architecture, self._codec(assets), params, clips, depth)
+        arch = self.architecture.generating(self.config.sample, depth)
+        return TokenImagination(self.config, arch, self._codec(assets), params, clips, depth)
 
     def branching(self, params: Params, assets: Assets, has_depth: bool, lanes: int = 1) -> TokenBranching:
         arch = self.architecture.generating(self.config.sample, has_depth)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rsjax.clip import Video
-from rsjax.config import DepthHead, SampleConfig
+from rsjax.config import DepthBranch, DepthHead, SampleConfig, SmallDepthBranch
 from rsjax.data.store import Store
 from rsjax.models.base import create_model
 from rsjax.models.branch_states import Branching, BranchState, Decoding
@@ -58,19 +58,26 @@ def assert_same(one: BranchState, other: BranchState) -> None:
         np.testing.assert_array_equal(cells, other.tokens[name])
 
 
-@pytest.mark.parametrize("way", ["branch", "head"])
-def test_frames_are_those_of_generate(way: str, model: TrainedModel, clips: Store) -> None:
-    if way == "head":
-        model = toy.trained(clips, toy.with_model(model.config, depth=DepthHead()))
+WAYS = {
+    "branch": DepthBranch(),
+    "small branch": SmallDepthBranch(width=16, blocks=1, cells=2),
+    "head": DepthHead(),
+    "unread head": DepthHead(feed_back=False),
+}
+
+
+@pytest.mark.parametrize("depth", WAYS.values(), ids=WAYS)
+def test_frames_are_those_of_generate(depth: object, model: TrainedModel, clips: Store) -> None:
+    model = toy.trained(clips, toy.with_model(model.config, depth=depth))
     lanes = model.model.branching(model.params, model.assets, True, lanes=2)
     actions, clip = rows(1), clips.source("test")[1]
     made = alone(lanes, lanes.begin(first(clips, 1)), actions[1:], replace(DRAWN, draw=0))
     video = model.generate(clip["rgb"][:1], actions, clip["depth"][:1])
     rgb = np.stack([state.rgb for state in made])
     assert np.abs(rgb.astype(int) - video.rgb[1:]).max() <= 1  # pictures decoded in other numbers differ by a level
-    depth = lanes.depth(made[-1])
-    assert video.depth is not None and depth is not None
-    np.testing.assert_allclose(depth, video.depth[-1], rtol=0.01)
+    last = lanes.depth(made[-1])
+    assert video.depth is not None and last is not None
+    np.testing.assert_allclose(last, video.depth[-1], rtol=0.01)
 
 
 def test_frames_of_mean_codes_are_those_of_generate_and_drawn_ones_may_come_between(

@@ -10,7 +10,7 @@ from rsjax.config import SampleConfig
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.sample import encode_prompt, rollout, rollout_from
 from tests.models.roboscape.toy import depart
-from tests.models.roboscape.toy_sample import DUAL, KEY, NO_PARAMS, RGB, count_model, given, random_params
+from tests.models.roboscape.toy_sample import DUAL, KEY, NO_PARAMS, RGB, SMALL, count_model, given, random_params
 
 CANDIDATES, PROMPT, FRAMES = 3, 3, 8
 
@@ -19,9 +19,10 @@ CANDIDATES, PROMPT, FRAMES = 3, 3, 8
     ("model", "sample"),
     [
         (DUAL, SampleConfig(temperature=1.0)),
+        (SMALL, SampleConfig(temperature=1.0)),
         (depart(RGB, rotary=True, action_dropout=0.1), SampleConfig(temperature=1.0, guidance=2.0)),
     ],
-    ids=["dual", "rotary-guided"],
+    ids=["dual", "small-branch", "rotary-guided"],
 )
 def test_sharing_a_prompt_is_repeating_it(model: Architecture, sample: SampleConfig) -> None:
     params, (tokens, actions) = random_params(model), given(model, PROMPT, FRAMES, CANDIDATES)

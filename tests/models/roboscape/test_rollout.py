@@ -14,9 +14,19 @@ from rsjax.models.roboscape.sample import rollout
 from rsjax.models.roboscape.transformer import TokenEmbed, Transformer
 from rsjax.tokenizers import lfq
 from tests.models.roboscape.toy import depart
-from tests.models.roboscape.toy_sample import BATCH, DUAL, HEAD, KEY, NO_PARAMS, RGB, count_model, given, random_params
+from tests.models.roboscape.toy_sample import (
+    BATCH,
+    DUAL,
+    HEAD,
+    KEY,
+    NO_PARAMS,
+    RGB,
+    SMALL,
+    count_model,
+    given,
+    random_params,
+)
 
-SMALL = replace(DUAL, depth_width=8, depth_blocks=1, depth_cells=3)
 WHOLE = depart(DUAL, read_previous=True, whole_frames=True)
 ADAPTIVE = replace(depart(DUAL, more_norms=True), action_encoder="norms")
 

@@ -12,7 +12,7 @@ from rsjax.config import SampleConfig
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.sample import CLIPS, State, rollout, start, step, where
 from tests.models.roboscape.toy import depart
-from tests.models.roboscape.toy_sample import BATCH, DUAL, KEY, RGB, given, random_params
+from tests.models.roboscape.toy_sample import BATCH, DUAL, KEY, RGB, SMALL, given, random_params
 
 SUMS = depart(replace(DUAL, action_inputs=4), integrate_actions=True, read_previous=True)
 GUIDED = depart(RGB, action_dropout=0.1, rotary=True, read_previous=True)
@@ -25,6 +25,7 @@ FRAMES = 15
         (SUMS, SampleConfig(steps=2, temperature=1.0, window_stride=2)),
         (GUIDED, SampleConfig(steps=2, unmask="greedy", guidance=2.0)),
         (SUMS, SampleConfig(steps=2, mean_codes=True, read_means=True)),
+        (depart(SMALL, read_previous=True), SampleConfig(steps=2, window_stride=2)),
         (depart(SUMS, whole_frames=True), SampleConfig(steps=1, mean_codes=True, read_means=True, window_stride=2)),
         (depart(SUMS, whole_frames=True), SampleConfig(steps=1, temperature=1.0, window_stride=5, sums="clip")),
         (depart(GUIDED, whole_frames=True), SampleConfig(steps=1, guidance=2.0)),
@@ -33,6 +34,7 @@ FRAMES = 15
         "dual-sums",
         "rotary-guided",
         "read-means",
+        "small-branch",
         "whole-frames",
         "whole-frames-one-kept-sums-of-the-clip",
         "whole-frames-rotary-guided",

@@ -13,7 +13,7 @@ from rsjax.models.roboscape.sample import rollout, window_actions, window_start
 from rsjax.models.roboscape.teacher_forcing import score_tokens
 from rsjax.models.roboscape.transformer import Transformer
 from tests.models.roboscape.toy import depart
-from tests.models.roboscape.toy_sample import BATCH, DUAL, HEAD, KEY, RGB, given, random_params
+from tests.models.roboscape.toy_sample import BATCH, DUAL, HEAD, KEY, RGB, SMALL, given, random_params
 
 SAMPLE = SampleConfig(steps=1, window_stride=2)
 SUMS = depart(replace(RGB, action_inputs=4), integrate_actions=True, read_previous=True)
@@ -60,8 +60,9 @@ def by_definition(model: Architecture, past: int, frames: int, no_depth: np.ndar
         (ROTARY, 1, 11, NONE),
         (WHOLE, 2, 9, NONE),
         (HEAD, 2, 5, FIRST),
+        (SMALL, 2, 5, FIRST),
     ],
-    ids=["dual", "some-without-depth-short", "windows-sums", "rotary-long", "whole-frames", "head"],
+    ids=["dual", "some-without-depth-short", "windows-sums", "rotary-long", "whole-frames", "head", "small-branch"],
 )
 def test_one_pass_with_the_cache_is_one_full_pass_for_each_frame(
     model: Architecture, past: int, frames: int, no_depth: np.ndarray

@@ -68,3 +68,23 @@ def test_generation_without_depth_leaves_it_out(tmp_path: Path) -> None:
     assert both.depth is not None
     assert alone.depth is None
     np.testing.assert_array_equal(alone.rgb, both.rgb)
+    planned = trained.model.plan(*inputs, depth=False)
+    assert planned.depth is None
+    np.testing.assert_array_equal(planned.rgb, both.rgb)
+
+
+def test_an_environment_without_depth_runs_without_the_head(tmp_path: Path) -> None:
+    clips = toy.store(tmp_path / "clips")
+    config = toy.with_model(toy.config(), depth=DepthHead(feed_back=False), sample=SampleConfig(steps=2))
+    trained = toy.trained(clips, config)
+    clip = clips.source("test")[0]
+    first = Video(clip["rgb"][None, :1], clip["depth"][None, :1])
+    without = {name: values for name, values in trained.params.items() if name != "depth_head"}
+    frames = []
+    for params, depth in ((trained.params, True), (without, False)):
+        imagination = trained.model.imagine(params, trained.assets, 1, depth)
+        imagination.restart(np.array([True]), first, np.zeros(1, int))
+        video = imagination.step(clip["actions"][1:2])
+        assert (video.depth is not None) == depth
+        frames.append(video.rgb)
+    np.testing.assert_array_equal(*frames)

@@ -16,6 +16,7 @@ from rsjax.models.roboscape.transformer import Transformer
 DUAL = Architecture(frames=6, grid=3, code_bits=6, action_inputs=3, width=16, blocks=2, heads=2)
 RGB = replace(DUAL, depth="none")
 HEAD = replace(DUAL, depth="head")
+SMALL = replace(DUAL, depth_width=8, depth_blocks=1, depth_cells=3)
 BATCH, KEY = 2, jax.random.key(5)
 NO_PARAMS: dict[str, Any] = {"blocks": {}}  # of a model that is taken out
 
