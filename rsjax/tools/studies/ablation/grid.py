@@ -22,6 +22,7 @@ from rsjax.progress import note
 Value = bool | int | float | str
 
 PHYSICS = ("model.depth=none,branch,head", "model.loss.keypoints=none,printed,difference,motion")
+ATTENTION = "model.loss.attention_weight"
 WEIGHTS = (  # λ₁, λ₂, λ₃, γ, K and N₀ in equal ratios around the usual values
     "model.loss.depth_weight=0.1,0.3,1,3,10",
     "model.loss.keypoint_weight=0.001,0.003,0.01,0.03,0.1",
@@ -159,10 +160,28 @@ def chosen_grid(base: Config, texts: Sequence[str], seeds: Sequence[int]) -> Gri
         ConfigError: as for :func:`parse_axes` and :func:`expand`.
     """
     if tuple(texts) == ("physics",):
-        return expand(base, parse_axes(base, PHYSICS), seeds)
+        return physics_grid(base, seeds)
     if tuple(texts) == ("weights",):
         return expand_each(base, parse_axes(base, WEIGHTS), seeds)
     return expand(base, parse_axes(base, texts), seeds)
+
+
+def physics_grid(base: Config, seeds: Sequence[int]) -> Grid:
+    """Returns the cells of all ways to use depth and keypoint terms.
+
+    Eq. 7 is a part of the printed terms alone: its cost would hide what the others do.
+
+    Raises:
+        ConfigError: as for :func:`make_grid`.
+    """
+    axes = parse_axes(base, PHYSICS)
+    usual = values_of(base, (ATTENTION,))[ATTENTION]
+    combinations = []
+    for values in itertools.product(*axes.values()):
+        combination = dict(zip(axes, values, strict=True))
+        has_eq_7 = combination["model.loss.keypoints"] in ("none", "printed")  # with none it has no effect
+        combinations.append(combination | {ATTENTION: usual if has_eq_7 else 0.0})
+    return make_grid(base, (*axes, ATTENTION), combinations, seeds)
 
 
 def expand(base: Config, axes: Mapping[str, Sequence[Value]], seeds: Sequence[int]) -> Grid:

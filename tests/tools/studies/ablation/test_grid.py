@@ -90,10 +90,11 @@ def test_without_axes_there_is_a_cell_per_seed() -> None:
 
 
 def test_the_grid_of_physics_is_how_depth_is_used_by_the_keypoint_term() -> None:
-    models = map(toy.roboscape, chosen_grid(presets.roboscape_tiny(), ["physics"], [0]).cells.values())
+    models = [*map(toy.roboscape, chosen_grid(presets.roboscape_tiny(), ["physics"], [0]).cells.values())]
     ways = ("none", "branch", "head")
     terms = ("none", "printed", "difference", "motion")
     assert [(m.depth.kind, m.loss.keypoints) for m in models] == list(product(ways, terms))
+    assert [m.loss.attention_weight for m in models] == [1.0, 1.0, 0.0, 0.0] * 3, "Eq. 7 belongs to the printed terms"
 
 
 def test_the_grid_of_weights_varies_one_field_at_a_time_in_equal_ratios() -> None:
