@@ -1,7 +1,9 @@
 """Computes one batch on all of this process's devices: parameters on each, the batch's rows divided among them."""
 
+import platform
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import Any, TypeVar
 
 import jax
@@ -18,6 +20,17 @@ _ROWS = "rows"
 def on_cpu() -> bool:
     """Returns whether this process computes on a CPU. For the size of passes; a program's platform decides its code."""
     return jax.default_backend() == "cpu"
+
+
+def device_name() -> str:
+    """Returns the kind of this process's first device; of a CPU, which jax calls "cpu", the processor's name."""
+    device = jax.local_devices()[0]
+    if device.platform != "cpu":
+        return device.device_kind
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.exists() else []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()
 
 
 def replicate(params: Tree) -> Tree:

@@ -2,9 +2,7 @@
 
 import datetime
 import os
-import platform
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -12,6 +10,7 @@ from rich.table import Table
 
 from rsjax.config import Config, require
 from rsjax.config.config_fields import config_fields
+from rsjax.devices import device_name
 from rsjax.errors import did_you_mean
 from rsjax.tools.bench import inputs, parts
 from rsjax.tools.bench.roofline import roofline
@@ -162,13 +161,6 @@ def ratios(numbers: dict[str, Any], dual: bool) -> dict[str, Any]:
 
 def facts(config: Config, batch: int) -> dict[str, Any]:
     """Returns facts about the model, the machine and the date."""
-    device = jax.local_devices()[0]
-    name = device.device_kind
-    if device.platform == "cpu":
-        info = Path("/proc/cpuinfo")
-        lines = info.read_text().splitlines() if info.exists() else []
-        names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-        name = names[0] if names else platform.processor() or platform.machine()
     model = config_fields(config.model)
     return {
         "preset": config.name,
@@ -176,8 +168,8 @@ def facts(config: Config, batch: int) -> dict[str, Any]:
         "model": config.model.family,
         "frames": config.clips.frames,
         **{name: model[name].value for name in MODEL_FACTS if name in model},
-        "device": name,
-        "platform": device.platform,
+        "device": device_name(),
+        "platform": jax.local_devices()[0].platform,
         "cores": len(os.sched_getaffinity(0)),
         "jax": jax.__version__,
         "xla_flags": os.environ.get("XLA_FLAGS", ""),

@@ -18,6 +18,7 @@ import rsjax
 from rsjax.config import Config, TrainConfig, to_dict
 from rsjax.config.config_fields import config_fields
 from rsjax.data.store import MANIFEST
+from rsjax.devices import device_name
 from rsjax.files import FileError, parse_json, read_json, regular, write_json
 from rsjax.tools.pipeline.run import Run
 
@@ -160,7 +161,7 @@ def machine() -> dict[str, Any]:
         "system": platform.platform(),
         "python": platform.python_version(),
         "cpu_cores": os.cpu_count(),
-        "device_kind": devices[0].device_kind,
+        "device_kind": device_name(),
         "platform": devices[0].platform,
         "local_devices": len(devices),
         "devices": jax.device_count(),

@@ -9,10 +9,10 @@ from functools import reduce
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 from jaxtyping import UInt8
 
+from rsjax.devices import device_name
 from rsjax.errors import UserError
 from rsjax.evaluation.results import read_frames
 from rsjax.files import disk_guard, write_file, write_json
@@ -90,7 +90,7 @@ def _summary(plan: Plan, outcomes: Sequence[Outcome]) -> dict[str, Any]:
     spent = {key: run.seconds(stage) for run in runs for stage, key in run.keys().items()}
     states = Counter(result.state for result in results.values())
     return {
-        "made": f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC, {jax.local_devices()[0].device_kind}, {os.cpu_count()} cores",
+        "made": f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC, {device_name()}, {os.cpu_count()} cores",
         "states": ", ".join(f"{count} {state}" for state, count in states.items()),
         "spent": duration(sum(spent.values())),
         "budget": duration(plan.scale.seconds),
