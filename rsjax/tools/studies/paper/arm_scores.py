@@ -16,7 +16,9 @@ from rsjax.tools.studies.results import RunResult, Spread, spread
 ReadScores = Callable[[Run, str], tuple[Scores, str]]
 
 CEILING = "psnr_tokenizer"  # PSNR of the reconstruction by each family's own autoencoder, a limit on the prediction's
-BASELINES = ("_repeat_first", "_tokenizer")  # suffixes of the scores of what a model is compared with
+# Suffixes of the scores of what a model is compared with. "_truth": what a network reads from the true frames, which is
+# its own error.
+BASELINES = ("_repeat_first", "_tokenizer", "_truth")
 CLIP_DIGITS = 4  # significant digits of a clip's score, here as in the committed files
 SEED_DIGITS = 6  # of a seed's
 

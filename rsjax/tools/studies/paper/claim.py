@@ -145,6 +145,8 @@ class Claim:
 
 # The depth errors that models without depth have, too: an estimator's, by the protocol that the paper follows.
 ESTIMATED_DEPTH = tuple(f"depth_{name}_median_estimator" for name in ("absrel", "delta1", "delta2"))
+# An estimator's error in metres. Reports have it for the true frames too, where it is the estimator's own.
+ESTIMATOR_ERROR = "depth_absrel_exact_estimator"
 
 
 def pairs(better: str, than: str, *metrics: str) -> tuple[ArmComparison, ...]:

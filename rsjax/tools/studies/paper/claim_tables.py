@@ -9,7 +9,7 @@ from rsjax.evaluation.statistics import Estimate, Verdict
 from rsjax.tools.studies.ablation.figure import draw
 from rsjax.tools.studies.paper.arm_scores import BASELINES, CEILING, ArmScores
 from rsjax.tools.studies.paper.judge import Judged, Outcome
-from rsjax.tools.studies.report.score_charts import SCENES
+from rsjax.tools.studies.report.score_charts import PLACE_SCENES
 from rsjax.tools.studies.tables import ABSENT, CellText, Marked, Table, mean_text, number_text, p_text
 
 LEGEND = (
@@ -163,7 +163,7 @@ def _arm(arm: ArmScores, outcome: Outcome, columns: Sequence[Metric]) -> dict[st
 
 
 def _baselines(outcome: Outcome, columns: Sequence[Metric]) -> list[dict[str, Any]]:
-    """Returns the scores of both baselines (first frame repeated, reconstruction) from the first arm that has any."""
+    """Returns the scores of first frame repeated, reconstruction and true frames, from the first arm that has any."""
     first = next((arm for arm in outcome.arms if arm.seeds), None)
     if first is None:
         return []
@@ -177,7 +177,7 @@ def _baselines(outcome: Outcome, columns: Sequence[Metric]) -> list[dict[str, An
                 number_text(means.get(name), f".{column.decimals}f")
                 for name, column in zip(names, columns, strict=True)
             ]
-            rows.append({"name": SCENES[suffix] + of.get(suffix, ""), "scores": texts})
+            rows.append({"name": PLACE_SCENES[suffix] + of.get(suffix, ""), "scores": texts})
     return rows
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from rsjax.config import ComponentConfig, Config, ConfigError, CurriculumStageConfig, metaworld, presets
+from rsjax.config import ComponentConfig, Config, ConfigError, CurriculumStageConfig, metaworld, presets, require
 from rsjax.config.config_fields import config_fields, with_values
 from rsjax.config.sim import EXPERT
 from rsjax.tools.pipeline.run import Run
@@ -189,6 +189,7 @@ def arm_config(arm: Arm, scale: Scale, seed: int, vary: Vary = "model") -> Confi
         if arm.preset:  # the autoencoder is its own, so that its training is scaled too
             config = budget.cut(config, whole / (tokenizer + model))
         else:
+            require(whole > tokenizer, "its tokenizer alone takes as long as tokenizer and model of the base preset")
             steps = round(config.train.steps * (whole - tokenizer) / model) if model else config.train.steps
             config = budget.with_steps(config, steps)
     if arm.rate != 1:

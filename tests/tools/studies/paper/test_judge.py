@@ -139,6 +139,15 @@ def test_a_file_gives_the_tables_of_the_scores_that_it_was_written_from(
     assert read.judged[1].clips == CLIPS - 1 and read.judged[2].reason == "with: no 48 frames yet"
 
 
+def test_the_table_of_arms_has_what_an_estimator_reads_from_the_true_frames() -> None:
+    """Its own error, from which the others are to be read."""
+    name = "depth_absrel_exact_estimator"
+    arms = [arm(each, more={name: 0.0, f"{name}_tokenizer": 1.0, f"{name}_truth": 2.0}) for each in ("with", "without")]
+    found = judge_claim(replace(toy.claim(), shown=(name,)), arms)
+    rows = [row for row in tables(found)["arms"].splitlines() if "*true frames" in row or "*tokenizer's" in row]
+    assert len(rows) == 2 and all(row.count("*–*") == 1 for row in rows), "PSNR of true frames has no meaning"
+
+
 def some_seeds(whole: ArmScores, rows: slice) -> ArmScores:
     """An arm with some of its finished seeds."""
     scores = {name: ScoreRows(scored.rows[rows]) for name, scored in whole.scores[""].items()}

@@ -3,7 +3,7 @@
 from typing import Any
 
 from rsjax.tools.studies.compare.published import published_by_metric
-from rsjax.tools.studies.paper.claim import ESTIMATED_DEPTH, Arm, Claim, pairs, register
+from rsjax.tools.studies.paper.claim import ESTIMATED_DEPTH, ESTIMATOR_ERROR, Arm, Claim, pairs, register
 
 _WITHOUT: dict[str, dict[str, Any]] = {
     "w/o depth": {"model.depth": "none"},
@@ -33,6 +33,7 @@ register(
             *pairs("full", "w/o depth", "psnr", "delta_psnr", *ESTIMATED_DEPTH),
             *pairs("full", "w/o keypoints", "psnr", "delta_psnr", "depth_absrel", *ESTIMATED_DEPTH),
         ),
+        shown=(ESTIMATOR_ERROR,),
         rank=0,
         notes=(
             "All arms train for the same steps; by counted operations, one without depth costs 0.49 of one with the "

@@ -15,6 +15,7 @@ register(
         place="§2.2; authors' answers, W10",
         arms=(Arm("curriculum", curriculum=EPOCHS), Arm("mixed", curriculum=EPOCHS, mixed=True)),
         comparisons=pairs("curriculum", "mixed", "psnr", "delta_psnr", "depth_absrel"),
+        shown=("lpips_alex", "depth_absrel_median_estimator"),
         rank=4,
         notes=(
             "Both arms draw the same shares of simple and difficult clips in the same number of steps; the paper "

@@ -116,7 +116,7 @@ register(
             ArmComparison(metric, "RoboScape", other, measurement=name)
             for other in ("Genie", "IRASim", "CogVideoX")
             for name in _PLACES.values()
-            for metric in ("psnr", *ESTIMATED_DEPTH, "delta_psnr", "psnr_motion")
+            for metric in ("psnr", *ESTIMATED_DEPTH, "delta_psnr", "psnr_motion", "lpips_alex")
             if (other, metric) != ("CogVideoX", "delta_psnr")  # CogVideoX has no actions
         ),
         rank=2,

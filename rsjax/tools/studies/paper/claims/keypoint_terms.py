@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from rsjax.tools.studies.paper.claim import Arm, Claim, pairs, register
+from rsjax.tools.studies.paper.claim import ESTIMATOR_ERROR, Arm, Claim, pairs, register
 
 _HEAD = {"model.depth": "head"}
 _TERMS: dict[str, dict[str, Any]] = {
@@ -28,8 +28,36 @@ register(
             for name in _TERMS
             for pair in pairs(name, "without", "psnr_motion", "cube_error_widths", "gripper_error_widths", "psnr")
         ),
-        shown=("delta_psnr", "lpips_alex", "depth_absrel_median_estimator"),
+        shown=("delta_psnr", "lpips_alex", "depth_absrel_median_estimator", ESTIMATOR_ERROR),
         rank=3,
         notes=("All arms train for the same steps. The terms that are not in the paper come without Eq. 7.",),
+    )
+)
+
+_NEW = ("difference of codes", "motion head")
+_ALL = {"model.loss.num_keypoints": 256}  # N₀, all tracks of the presets
+
+register(
+    Claim(
+        name="keypoint-density",
+        title="Dense points instead of those that move most",
+        statement="Differences of codes and the motion head make moving regions better with all points than with 32.",
+        place="a reviewer's question on optical flow",
+        arms=(
+            *(Arm(f"{name}, 32 points", _HEAD | _TERMS[name]) for name in _NEW),
+            *(Arm(f"{name}, all points", _HEAD | _TERMS[name] | _ALL) for name in _NEW),
+        ),
+        comparisons=tuple(
+            pair
+            for name in _NEW
+            for pair in pairs(
+                f"{name}, all points",
+                f"{name}, 32 points",
+                *("psnr_motion", "cube_error_widths", "gripper_error_widths", "psnr"),
+            )
+        ),
+        shown=("delta_psnr", "lpips_alex", "depth_absrel_median_estimator"),
+        rank=5,
+        notes=("All arms train for the same steps. Both terms compare a frame with the one before it.",),
     )
 )

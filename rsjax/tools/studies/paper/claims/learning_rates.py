@@ -1,22 +1,33 @@
-"""The same number of learning rates tried for every family of Table 1."""
+"""Learning rates and batch sizes, tried on clips that no table scores: as many for every arm."""
 
 from dataclasses import replace
 
 from rsjax.tools.studies.paper.claim import Arm, Claim, pairs, register
-from rsjax.tools.studies.paper.claims.baselines import TABLE_1
+from rsjax.tools.studies.paper.claims.baselines import RATES, TABLE_1
 
 _FACTORS = {
     factor: "the preset's rate" if factor == 1 else f"{factor:g} × the preset's rate"
     for factor in (0.3, 1.0, 3.0, 10.0)
 }
+CLIPS = 1000  # sim.seed of the clips; the seeds of tables are far below
 
 
 def _trials(arm: Arm) -> tuple[Arm, ...]:
-    """Returns an arm of Table 1, and copies of it with the other learning rates of the world model."""
+    """Returns an arm of Table 1 on clips of its own, and copies of it with the other learning rates of the model."""
+    arm = replace(arm, values={**arm.values, "sim.seed": CLIPS}, published={})
     others = {factor: what for factor, what in _FACTORS.items() if factor != arm.rate}
     return (
-        replace(arm, published={}),
-        *(replace(arm, name=f"{arm.name}, {what}", rate=factor, published={}) for factor, what in others.items()),
+        arm,
+        *(replace(arm, name=f"{arm.name}, {what}", rate=factor) for factor, what in others.items()),
+    )
+
+
+def _batches(arm: Arm) -> tuple[Arm, ...]:
+    """Returns an arm on clips of its own with the presets' batch, and copies with half and twice as many clips."""
+    values = {**arm.values, "sim.seed": CLIPS}
+    return tuple(
+        replace(arm, name=f"{arm.name}, {size} clips a step", values={**values, "train.batch_size": size})
+        for size in (4, 2, 8)
     )
 
 
@@ -36,6 +47,38 @@ register(
             for comparison in pairs(chosen.name, other.name, "psnr")
         ),
         rank=6,
-        notes=("Four trials a family; autoencoders keep the rates of their presets.",),
+        notes=(
+            "Four trials a family; autoencoders keep the rates of their presets.",
+            "The clips have a seed of their own, so a rate is not chosen on clips on which a table scores it.",
+        ),
+    )
+)
+
+_BATCHES = tuple(
+    map(
+        _batches,
+        (
+            Arm("RoboScape", equal="seconds", rate=RATES["RoboScape"]),
+            Arm("second head", {"model.depth": "head", "model.loss.keypoints": "none"}, equal="seconds"),
+            Arm("Genie", model="genie", equal="seconds", rate=RATES["Genie"]),
+        ),
+    )
+)
+
+register(
+    Claim(
+        name="batch-sizes",
+        title="The batch size of the small presets",
+        statement="Four clips a step are better than two or eight, in equal time.",
+        place="the fairness of Table 1",
+        arms=tuple(arm for arms in _BATCHES for arm in arms),
+        comparisons=tuple(
+            comparison
+            for usual, *others in _BATCHES
+            for other in others
+            for comparison in pairs(usual.name, other.name, "psnr")
+        ),
+        rank=6,
+        notes=("The learning rates are those of four clips a step. The clips are those of the claim learning-rates.",),
     )
 )

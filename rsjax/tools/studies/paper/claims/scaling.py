@@ -1,6 +1,6 @@
 """Figures 6 and 7: larger models and more data."""
 
-from rsjax.tools.studies.paper.claim import ESTIMATED_DEPTH, Arm, Claim, pairs, register
+from rsjax.tools.studies.paper.claim import ESTIMATED_DEPTH, ESTIMATOR_ERROR, Arm, Claim, pairs, register
 
 _METRICS = ("psnr", "delta_psnr", "lpips_alex", "depth_absrel", *ESTIMATED_DEPTH, "ssim")
 
@@ -19,6 +19,7 @@ register(
             Arm("L"),
         ),
         comparisons=(*pairs("M", "S", *_METRICS), *pairs("L", "M", *_METRICS)),
+        shown=(ESTIMATOR_ERROR,),
         rank=3,
         notes=("Widths 32, 64 and 128 in equal steps, as the paper's double too; L is the base preset.",),
     )
@@ -37,6 +38,7 @@ register(
             *pairs("a half", "a sixth", "psnr", "delta_psnr"),
             *pairs("all", "a half", "psnr", "delta_psnr"),
         ),
+        shown=("lpips_alex", "ssim", *ESTIMATED_DEPTH, ESTIMATOR_ERROR),
         rank=3,
         notes=(
             "1, 3 and 6 parts of the clips, as in the paper, in equal steps; the tokenizer has seen all of them. "
