@@ -178,7 +178,7 @@ class RoboScape(WorldModel[Batch]):
     ) -> Video:
         """Encodes the prompt, rolls out tokens and decodes them. T may exceed the trained positions."""
         sample = self.config.sample
-        arch = self.architecture.generating(sample, depth)
+        arch = self.architecture.generating(sample, depth and bool(prompt.has_depth.any()))
         tokens, has_depth = self._tokens(assets, prompt, arch)
         tokens, inputs = divide((tokens, self._action_inputs(assets, actions)), params)
         key = jax.random.key(sample.seed)
@@ -201,7 +201,7 @@ class RoboScape(WorldModel[Batch]):
             ValueError: the candidates' actions into the prompt's frames differ.
         """
         sample = self.config.sample
-        arch = self.architecture.generating(sample, depth)
+        arch = self.architecture.generating(sample, depth and bool(prompt.has_depth.any()))
         candidates = len(actions)
         past = prompt.rgb.shape[1]
         if np.any(actions[:, 1:past] != actions[:1, 1:past]):

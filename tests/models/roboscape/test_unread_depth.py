@@ -68,6 +68,9 @@ def test_generation_without_depth_leaves_it_out(tmp_path: Path) -> None:
     assert both.depth is not None
     assert alone.depth is None
     np.testing.assert_array_equal(alone.rgb, both.rgb)
+    without = {name: values for name, values in trained.params.items() if name != "depth_head"}
+    shown = replace(trained, params=without).generate(clip["rgb"][:1], clip["actions"])  # of a prompt without depth
+    np.testing.assert_array_equal(shown.rgb, both.rgb[0])
     planned = trained.model.plan(*inputs, depth=False)
     assert planned.depth is None
     np.testing.assert_array_equal(planned.rgb, both.rgb)
