@@ -34,6 +34,31 @@ register(
     )
 )
 
+_PRINTED: dict[str, dict[str, Any]] = {
+    "Eq. 5 alone": {"model.loss.attention_weight": 0.0},
+    "Eq. 7 alone": {"model.loss.keypoint_weight": 0.0},
+    "printed Eq. 5 and 7": {},
+}
+
+register(
+    Claim(
+        name="printed-terms",
+        title="Eq. 5 and Eq. 7, each alone and together",
+        statement="Keypoint learning proves essential for both visual fidelity and action controllability.",
+        place="§3.2, of Eq. 5 and Eq. 7 one by one",
+        arms=(
+            Arm("without", _HEAD | {"model.loss.keypoints": "none"}),
+            *(Arm(name, _HEAD | values) for name, values in _PRINTED.items()),
+        ),
+        comparisons=tuple(
+            pair for name in _PRINTED for pair in pairs(name, "without", "psnr", "psnr_motion", "delta_psnr")
+        ),
+        shown=("cube_error_widths", "gripper_error_widths", "lpips_alex", "depth_absrel_median_estimator"),
+        rank=5,
+        notes=("All arms train for the same steps and predict depth by a second head.",),
+    )
+)
+
 _NEW = ("difference of codes", "motion head")
 _ALL = {"model.loss.num_keypoints": 256}  # N₀, all tracks of the presets
 
