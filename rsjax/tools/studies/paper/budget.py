@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import jax
 
-from rsjax.config import SIMULATOR, Config, TokenizerConfig, TokenModelConfig, TrainConfig, require
+from rsjax.config import SIMULATOR, Config, SmallDepthBranch, TokenizerConfig, TokenModelConfig, TrainConfig, require
 from rsjax.config.config_fields import with_values
 from rsjax.evaluation.depth_network import BATCH
 from rsjax.models.base import create_autoencoder, create_model
@@ -24,6 +24,9 @@ EPISODE = 0.41  # seconds to simulate an episode
 TOKENS = 1 / 26  # seconds to make the tokens of a clip or of a moved copy of it
 STEP = 0.06  # fixed seconds of a world model's step
 RATE = 1.4e11  # operations per second of the rest of the step
+# A narrow depth branch, or one at coarser cells, takes longer than its operations say: by this share of a step without
+# depth. With it, estimated steps are within 8 % of those measured in docs/depth.md.
+SMALL_BRANCH = 0.15
 # Operations per second of the tokenizer's training, with Muon: 4.1e10 in float32; a step in bf16 takes 0.89 × the time.
 TOKENIZER_RATE = 4.6e10
 START = 15.0  # seconds until a training's first step: 27 for the first training with its shapes, 9 for the next
@@ -182,7 +185,13 @@ def step_seconds(config: Config) -> float:
     if config.model.family in FAMILY_STEPS:
         return FAMILY_STEPS[config.model.family][1]
     flops = train_flops(config)
-    return STEP + flops / max(1, config.train.steps) / RATE if flops is not None else 0.0
+    if flops is None:
+        return 0.0
+    seconds = STEP + flops / max(1, config.train.steps) / RATE
+    depth = getattr(config.model, "depth", None)
+    if isinstance(depth, SmallDepthBranch) and (depth.width or depth.cells > 1):
+        seconds += SMALL_BRANCH * step_seconds(with_values(config, {"model.depth": "none"}))
+    return seconds
 
 
 def tokenizer_step_seconds(config: Config) -> float:

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rsjax.config import Config, ConfigError, presets
+from rsjax.config.config_fields import with_values
 from rsjax.tools.pipeline.run import Run
 from rsjax.tools.studies.paper import budget
 from rsjax.tools.studies.paper.budget import HOUR, parse_duration, scale, step_seconds, training_cost
@@ -151,6 +152,21 @@ def test_equal_time_is_equal_steps_times_their_seconds(three_hours: Plan) -> Non
     genie = arm_config(Arm("", model="genie", equal="seconds"), three_hours.scale, 0)
     assert genie.train.steps > 1.5 * base.train.steps
     assert genie.train.steps * step_seconds(genie) == pytest.approx(base.train.steps * step_seconds(base), rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("way", "ratio"),
+    [
+        ({"model.depth": "head"}, 1.02),
+        ({"model.depth": "small_branch", "model.depth.width": 32}, 1.24),
+        ({"model.depth": "small_branch", "model.depth.width": 64}, 1.49),
+        ({"model.depth": "small_branch", "model.depth.blocks": 2}, 1.48),
+        ({"model.depth": "small_branch", "model.depth.cells": 2}, 1.40),
+    ],
+)
+def test_a_step_with_depth_is_estimated_as_it_was_measured_beside_one_without(way: dict, ratio: float) -> None:
+    alone = with_values(TINY, {"model.depth": "none"})
+    assert step_seconds(with_values(TINY, way)) / step_seconds(alone) == pytest.approx(ratio, rel=0.08)
 
 
 @pytest.mark.parametrize(("preset", "simple"), [("roboscape_tiny", 0.55), ("roboscape_multitask", 0.5)])

@@ -68,6 +68,7 @@ def _register(name: str, equal: Literal["seconds", "flops", "steps"], title: str
             notes=(
                 f"All arms train for equal {title}. Second head, Genie and twice the blocks are those of {name}.",
                 "Genie has the best of four learning rates; the others have the same rate, not tuned for them.",
+                "Seconds are estimates (docs/depth.md has measured steps); the table has the measured minutes.",
             ),
         )
     )
