@@ -233,8 +233,9 @@ class LossConfig:
     attention_weight: float = 1.0  # λ₃
     gamma: float = 5.0  # γ of Eq. 6
     # How Eq. 6 weighs cells. printed: Eq. 7, a second cross-entropy beside L_RGB. normalised: weights of the mean 1 on
-    # the one cross-entropy, whose weight is 1 (rsjax.models.roboscape.departures.normalised_attention).
-    attention: Literal["printed", "normalised"] = "printed"
+    # the one cross-entropy, whose weight is 1; contact: the same, spent on points that rest before they move instead of
+    # on those that move most (rsjax.models.roboscape.departures.normalised_attention).
+    attention: Literal["printed", "normalised", "contact"] = "printed"
     # The keypoint term. printed: Eq. 5, whose minimum is not the truth. Not in the paper, each in a file of
     # rsjax.models.roboscape.departures: difference (keypoint_difference), the change of a point's code from frame to
     # frame; motion (motion_head), where each point goes; feature (keypoint_features), the network's features along a
@@ -462,7 +463,7 @@ class RoboScapeConfig(TokenModelConfig):
         off = set() if self.uses_depth else {"depth"}
         off |= {"keypoint", "attention"} if self.loss.keypoints == "none" else set()
         weights = {"rgb": 1.0} | {name: x for name, x in loss_weights(self.loss).items() if name not in off}
-        if "attention" in weights and self.loss.attention == "normalised":
+        if "attention" in weights and self.loss.attention != "printed":
             # It takes the place of L_RGB, which is still logged.
             weights |= {"rgb": 0.0, "attention": 1.0}
         return weights | self.state_weights

@@ -19,7 +19,7 @@ from rsjax import clip
 from rsjax.config import RoboScapeConfig, TokenModelConfig
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.departures.keypoint_terms import other_keypoint_term
-from rsjax.models.roboscape.departures.normalised_attention import normalised
+from rsjax.models.roboscape.departures.normalised_attention import moved_by_others, normalised
 from rsjax.models.roboscape.departures.observed_anchor import anchor
 from rsjax.models.roboscape.departures.second_view import SECOND, WEIGHT
 from rsjax.models.roboscape.departures.visible_keypoints import counted_frames
@@ -124,7 +124,11 @@ def loss_terms(
             terms["keypoint"] = other_keypoint_term(config, bits, logits["rgb"], targets["rgb"], *sample, trunk, motion)
 
         # Eq. 6 and 7: L_Attention = -Σ_t A_t ⊙ s_t log p(ŝ_t). It is divided by the number of cells, not by Σ A.
-        attention = attention_map(keypoints, grid, config.loss.gamma)
+        marked = keypoints
+        if config.loss.attention == "contact":
+            touched = moved_by_others(batch.tracks, batch.visible, grid)
+            marked = select(batch.tracks, touched, count, grid)
+        attention = attention_map(marked, grid, config.loss.gamma)
         if config.loss.attention == "printed":
             terms["attention"] = jnp.sum(nats * attention * masked), jnp.sum(masked)
         else:

@@ -210,6 +210,32 @@ def test_normalised_attention_is_a_cross_entropy_whose_weights_have_the_mean_1()
     np.testing.assert_allclose(found["rgb"][0] / found["rgb"][1], np.mean(nats[counted]), rtol=1e-5)
 
 
+def test_attention_to_contact_weighs_the_cells_of_points_that_rest_before_they_move() -> None:
+    steps = np.zeros((B, TRACKS, T, 2), np.float32)
+    steps[:, 0, 1:, 0] = 0.9  # moves from the start
+    steps[:, 1, 2:, 0] = 0.9  # is moved later
+    steps[:, 2, 2:, 0] = 0.2  # trembles
+    steps[:, 3, 2:, 1] = 0.9  # is moved later, and was hidden at first
+    places = np.tile(np.array([0.5, 1.5, 2.5, 0.5, 1.5])[:, None, None], (1, T, 2))
+    tracks = ((places + steps) / GRID).astype(np.float32)
+    visible = np.ones((B, TRACKS, T), bool)
+    visible[:, 3, 0] = False
+    visible[1, 1, 3] = False  # in the second clip, the point is not seen in the last frame
+    emphasis = np.ones((B, T, GRID, GRID))
+    for clip in range(B):
+        for t in range(T):
+            if visible[clip, 1, t]:
+                column, row = (tracks[clip, 1, t] * GRID).astype(int)
+                emphasis[clip, t, row, column] = 7.0
+    nats = np.asarray(lfq.token_cross_entropy(jnp.array(LOGITS), jnp.array(TOKENS), BITS))
+    counted = MASK & (WEIGHT > 0)[:, None, None, None]
+    weights = emphasis[counted] / emphasis[counted].mean()
+    total, weight = terms("printed", tracks=tracks, visible=visible, attention="contact", gamma=7.0)["attention"]
+    np.testing.assert_allclose(total / weight, np.mean(weights * nats[counted]), rtol=1e-5)
+    loss = LossConfig(attention="contact", keypoint_weight=0.0)
+    assert RoboScapeConfig(loss=loss, depth=NoDepth()).loss_weights == {"rgb": 0.0, "attention": 1.0}
+
+
 def test_a_flat_normalised_attention_is_the_objective_without_attention() -> None:
     flat = RoboScapeConfig(loss=LossConfig(attention="normalised", gamma=1.0, keypoint_weight=0.0), depth=NoDepth())
     without = RoboScapeConfig(loss=LossConfig(attention_weight=0.0, keypoint_weight=0.0), depth=NoDepth())

@@ -59,6 +59,32 @@ register(
     )
 )
 
+_WEIGHTS = {
+    "moving cells": {"model.loss.keypoint_weight": 0.0, "model.loss.attention": "normalised"},
+    "contact cells": {"model.loss.keypoint_weight": 0.0, "model.loss.attention": "contact"},
+}
+
+register(
+    Claim(
+        name="attention-cells",
+        title="One normalised weight, spent on moving or on contact cells",
+        statement="A cross-entropy that counts the cells of things that are moved more brings them to the right place.",
+        place="a choice of ours beside Eq. 7",
+        arms=(
+            Arm("without", _HEAD | {"model.loss.keypoints": "none"}),
+            *(Arm(name, _HEAD | values) for name, values in _WEIGHTS.items()),
+        ),
+        comparisons=tuple(
+            pair
+            for name in _WEIGHTS
+            for pair in pairs(name, "without", "cube_error_widths", "gripper_error_widths", "psnr_motion", "psnr")
+        ),
+        shown=("delta_psnr", "lifted_accuracy", "lpips_alex", "depth_absrel_median_estimator"),
+        rank=5,
+        notes=("All arms train for the same steps. Contact cells are those of points that rest before they move.",),
+    )
+)
+
 _NEW = ("difference of codes", "motion head")
 _ALL = {"model.loss.num_keypoints": 256}  # N₀, all tracks of the presets
 
