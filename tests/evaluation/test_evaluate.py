@@ -45,7 +45,7 @@ def eval_clips() -> list[dict[str, np.ndarray]]:
 PLACES = {"cube_error_widths", "gripper_error_widths", "lifted_accuracy"}
 PROBED = {
     *("contact_false_success", "contact_false_failure", "contact_brier", "contact_judge_accuracy"),
-    *("drive_gripper_error_widths", "drive_psnr"),
+    *("drive_gripper_error_widths", "drive_psnr", "drive_worse_frames"),
 }
 TRUTH = {name: np.stack([clip[name] for clip in eval_clips()]) for name in ("rgb", "depth", "actions")}
 

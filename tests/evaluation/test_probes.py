@@ -134,5 +134,5 @@ def test_an_evaluation_scores_its_probes_and_generates_them_as_the_model_does(tm
     none = evaluate(trained, plain, probes=reason)
     assert {name for name, why in none.reasons.items() if why == str(reason)} == {
         *("contact_false_success", "contact_false_failure", "contact_brier", "contact_judge_accuracy"),
-        *("drive_gripper_error_widths", "drive_psnr"),
+        *("drive_gripper_error_widths", "drive_psnr", "drive_worse_frames"),
     }

@@ -61,5 +61,15 @@ def drive_psnr(scene: Scene) -> Scores:
     return scene.shared(psnr_per_frame).mean(-1)
 
 
+@metric("drive_worse_frames", "frames of drives worse than the first repeated", better="lower", column=False)
+def worse_frames(scene: Scene) -> Scores:
+    """Returns the share of each drive's predicted frames whose PSNR is below that of the last prompt frame repeated."""
+    first = scene.prompt_frames
+    truth = scene.drives.truth.rgb
+    still = psnr(truth, np.broadcast_to(truth[:, first - 1 : first], truth.shape))
+    worse: Scores = (scene.shared(psnr_per_frame) < np.asarray(still)[:, first:]).mean(-1)
+    return worse
+
+
 def _errors(drives: Drives, places: Float[np.ndarray, "D T 2"]) -> Float[np.ndarray, "D T"]:
     return np.linalg.norm(places - drives.gripper, axis=-1) / drives.width[:, None]

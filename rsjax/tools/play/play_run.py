@@ -29,7 +29,7 @@ from rsjax.tools.policies.run_data import RunData
 
 SIMULATORS = {"robosuite/Lift": "robosuite", "metaworld/": "metaworld"}  # source of clips → package that simulates it
 # Scores of the run's evaluation that say how far to trust what the page shows.
-MEASURED = ("contact_false_success", "drive_gripper_error_widths")
+MEASURED = ("contact_false_success", "contact_false_failure", "contact_brier", "drive_gripper_error_widths")
 FPS = 5.0  # for runs whose clips have no frame rate
 
 

@@ -78,6 +78,13 @@ def test_a_drive_s_errors_are_in_widths_of_its_cube_and_baselines_have_curves() 
     squares = (own.drives.truth.rgb.astype(float) - own.drives.prediction.rgb) ** 2
     expected = 10 * np.log10(255**2 / squares.mean((2, 3, 4)))[:, 1:]
     np.testing.assert_allclose(score("drive_psnr", own), expected.mean(1), rtol=1e-5)
+    still = np.repeat(own.drives.truth.rgb[:, :1], FRAMES, 1)
+    squares = (own.drives.truth.rgb.astype(float) - still) ** 2
+    worse = expected < 10 * np.log10(255**2 / squares.mean((2, 3, 4))[:, 1:])
+    assert worse.any() and not worse.all()
+    np.testing.assert_allclose(score("drive_worse_frames", own), worse.mean(1))
+    repeated = replace(own, probed=Probed(own.grasps, replace(own.drives, prediction=Video(still))))
+    assert not score("drive_worse_frames", repeated).any()
     curves = frame_curves({"": own, "_repeat_first": own})
     assert curves["drive_frame"] == list(range(2, FRAMES + 1))
     np.testing.assert_allclose(np.array(curves["drive_psnr"], float), expected.mean(0), rtol=1e-5)

@@ -61,9 +61,13 @@ export function build() {
 }
 
 /** Says how far the model can be trusted, from scores of the run's evaluation; "" without any. */
-function trust({ contact_false_success: lied, drive_gripper_error_widths: off }) {
+function trust(measured) {
+  const { contact_false_success: lied, contact_false_failure: lost, contact_brier: brier } = measured;
+  const off = measured.drive_gripper_error_widths;
   const lines = [];
   if (lied !== undefined) lines.push(`of the grasps that fail in the simulator, ${(100 * lied).toFixed(0)} % succeed here`);
+  if (lost !== undefined) lines.push(`of those that succeed there, ${(100 * lost).toFixed(0)} % fail here`);
+  if (brier !== undefined) lines.push(`the Brier score of grasps is ${brier.toFixed(2)} (a guess of one half has 0.25)`);
   if (off !== undefined) lines.push(`after 48 frames of free driving the gripper is ${off.toFixed(1)} cube widths astray`);
   return lines.length ? `How far to trust it: ${lines.join("; ")}.` : "";
 }

@@ -36,7 +36,7 @@ _PLACE_ROWS = tuple(PLACE_SCENES.items())
 _PLACE_ERRORS = ("cube_error_widths", "gripper_error_widths")
 _PLACES = (*_PLACE_ERRORS, "lifted_accuracy")  # metrics in a table of their own
 _CONTACTS = ("contact_false_success", "contact_false_failure", "contact_brier")
-_DRIVES = ("drive_gripper_error_widths", "drive_psnr")
+_DRIVES = ("drive_gripper_error_widths", "drive_psnr", "drive_worse_frames")
 _APART = (*_PLACES, *_CONTACTS, "contact_judge_accuracy", *_DRIVES)  # metrics that the tables of scores leave out
 _DEPTH_ROWS = (
     ("", "predicted depth, in metres"),

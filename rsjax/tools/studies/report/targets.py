@@ -51,6 +51,9 @@ TARGETS = (
         False,
         "widths",
     ),
+    MetricBound(
+        "frames of drives worse than the first repeated, share", itemgetter("drive_worse_frames"), 0.0, False, ""
+    ),
     MetricBound("ΔPSNR, another clip's actions", itemgetter("delta_psnr"), 7.0),
     MetricBound(
         "depth AbsRel, relative to repeating the first frame",
