@@ -206,6 +206,7 @@ class WorldModel(Trainable[B], Protocol[B]):
         actions: Float[np.ndarray, "N T A"],
         depth: bool = True,
         last: int | None = None,
+        past: Float[np.ndarray, "K A"] | None = None,
     ) -> Video:
         """Generates the videos that follow one prompt under N action sequences, with the same random draws.
 
@@ -214,6 +215,8 @@ class WorldModel(Trainable[B], Protocol[B]):
             actions: as for :meth:`generate`.
             depth: as for :meth:`generate`.
             last: return only this many frames, the last ones; a family need not decode the others.
+            past: the actions that led from the beginning of the clip into the prompt's first frame, if that is a later
+                one; a family need not read them.
         """
         repeated = prompt[np.zeros(len(actions), int)]
         alike = np.zeros(len(actions), int)

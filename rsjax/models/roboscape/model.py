@@ -18,7 +18,7 @@ from rsjax.config import ClipShape, Config, RoboScapeConfig, TokenizerConfig, To
 from rsjax.data.clips import first_clip, readable, spread
 from rsjax.data.codec import Record
 from rsjax.data.loader import Arrays, Transform
-from rsjax.data.normalization import Normalization
+from rsjax.data.normalization import Normalization, with_sums
 from rsjax.data.state_labels import knows_success, missing_labels
 from rsjax.data.store import Store, StoreError
 from rsjax.devices import divide
@@ -194,8 +194,11 @@ class RoboScape(WorldModel[Batch]):
         actions: Float[np.ndarray, "N T A"],
         depth: bool = True,
         last: int | None = None,
+        past: Float[np.ndarray, "K A"] | None = None,
     ) -> Video:
         """Encodes the prompt once, and continues it under every action sequence.
+
+        With ``model.sample.sums`` "clip", sums of actions go on from ``past``.
 
         Raises:
             ValueError: the candidates' actions into the prompt's frames differ.
@@ -203,16 +206,19 @@ class RoboScape(WorldModel[Batch]):
         sample = self.config.sample
         arch = self.architecture.generating(sample, depth and bool(prompt.has_depth.any()))
         candidates = len(actions)
-        past = prompt.rgb.shape[1]
-        if np.any(actions[:, 1:past] != actions[:1, 1:past]):
-            raise ValueError(f"the candidates' actions differ in rows before {past}, which led into the one prompt")
+        seen = prompt.rgb.shape[1]
+        if np.any(actions[:, 1:seen] != actions[:1, 1:seen]):
+            raise ValueError(f"the candidates' actions differ in rows before {seen}, which led into the one prompt")
         tokens, has_depth = self._tokens(assets, prompt, arch)
         inputs = self._action_inputs(assets, actions)
         resting = resting_actions(arch, sample, assets.normalization)
-        encoded = encode_prompt(arch, sample, params, tokens, inputs[:1, :past], ~has_depth, resting)
+        if past is not None and resting is not None:
+            scaled = assets.normalization.scaled(past) - assets.normalization.scaled(np.zeros_like(past))
+            inputs += with_sums(np.zeros(scaled.shape[-1:]), scaled.sum(0))
+        encoded = encode_prompt(arch, sample, params, tokens, inputs[:1, :seen], ~has_depth, resting)
         same_draws = jnp.zeros(candidates, jnp.int32)
         key = jax.random.key(sample.seed)
-        made = rollout_from(arch, sample, params, encoded, inputs[:, past:], key, same_draws)
+        made = rollout_from(arch, sample, params, encoded, inputs[:, seen:], key, same_draws)
         if last is not None:
             made = {branch: grid[:, -last:] for branch, grid in made.items()}
         return self._video(assets, made, np.repeat(has_depth & depth, candidates), prompt, tokens)

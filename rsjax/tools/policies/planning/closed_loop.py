@@ -112,7 +112,9 @@ class PlanningActor:
             depth = np.stack([each["depth"] for each in frames])
         else:
             depth = None
-        recent = RecentFrames(np.stack([each["rgb"] for each in frames]), depth, np.stack(self._actions[-kept:]))
+        past = np.stack(self._actions)[1 : len(self._actions) - kept + 1]
+        rgb = np.stack([each["rgb"] for each in frames])
+        recent = RecentFrames(rgb, depth, np.stack(self._actions[-kept:]), past)
         action = self._planner(recent).astype(np.float32)
         self._actions.append(action)
         self.seconds.append(time.monotonic() - began)

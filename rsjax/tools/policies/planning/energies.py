@@ -33,11 +33,13 @@ class RecentFrames:
         rgb: the last frames.
         depth: of the same frames, metres; None if the model has no depth.
         actions: row t led to frame t; row 0 is not read.
+        past: the actions that led from the episode's beginning into the first of these frames; none at the beginning.
     """
 
     rgb: UInt8[np.ndarray, "P S S 3"]
     depth: Float32[np.ndarray, "P S S"] | None
     actions: Float32[np.ndarray, "P A"]
+    past: Float32[np.ndarray, "K A"] | None = None
 
 
 def imagined(model: TrainedModel, score: Score, frames: int = HISTORY) -> Energy:
@@ -76,7 +78,7 @@ def _planned(model: TrainedModel, recent: RecentFrames, candidates: Float[np.nda
     prompt = Video(recent.rgb[None], None if recent.depth is None else recent.depth[None])
     actions = np.concatenate([before, candidates], axis=1)
     last = min(frames, candidates.shape[1])
-    return model.model.plan(model.params, model.assets, prompt, actions, depth=False, last=last)
+    return model.model.plan(model.params, model.assets, prompt, actions, depth=False, last=last, past=seen.past)
 
 
 def pixel_distance(goal: UInt8[np.ndarray, "S S 3"]) -> Score:

@@ -6,6 +6,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
+from rsjax.clip import Video
 from rsjax.config import ConfigError, StateHeadsConfig
 from rsjax.data.normalization import Normalization
 from rsjax.data.store import Store
@@ -121,6 +122,7 @@ def test_a_planner_acts_in_frames_with_and_without_depth() -> None:
             [1, 2, 2] if depths else [None] * 3
         )
         assert [seen.actions[-1, 0] for seen in asked] == [0, 1, 2]
+    assert [seen.past[:, 0].tolist() for seen in asked] == [[], [], [1]]
 
 
 def test_energies_are_scores_of_what_a_model_generates() -> None:
@@ -274,3 +276,20 @@ def test_a_comparison_resumes_and_counts(model: TrainedModel, tmp_path: Path, mo
     still: Any = replace(model.config.model, action_encoder="none")  # type: ignore[call-arg]
     with pytest.raises(UserError, match=r"the model takes no actions \(family 'roboscape'\)"):
         compare(replace(model, config=replace(model.config, model=still)), tmp_path, lift(), settings)
+
+
+def test_sums_of_actions_go_on_from_those_before_the_prompt(tmp_path: Path) -> None:
+    clips = toy.store(tmp_path / "clips")
+    config = toy.config()
+    departures = replace(config.model.departures, integrate_actions=True)
+    sample = replace(config.model.sample, sums="clip")
+    trained = toy.trained(clips, toy.with_model(config, departures=departures, sample=sample))
+    rng = np.random.default_rng(0)
+    rgb, rows = toy.clip(0).rgb[:1], rng.normal(0, 0.4, (1, 3, 28)).astype(np.float32)
+    inputs = trained.params, trained.assets, Video(rgb[None]), rows
+    model = trained.model
+    plain = model.plan(*inputs)
+    at_rest = model.plan(*inputs, past=np.zeros((5, 28), np.float32))
+    np.testing.assert_allclose(at_rest.rgb, plain.rgb, atol=1)
+    past = rng.normal(0, 0.4, (2, 28)).astype(np.float32)
+    assert (model.plan(*inputs, past=past).rgb != plain.rgb).any()
