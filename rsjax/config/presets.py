@@ -90,8 +90,6 @@ def tiny_policies() -> Config:
             # It has learned to read its own frames.
             departures=replace(model.departures, self_conditioning_after=0),
             state_heads=StateHeadsConfig(),
-            # Its clips begin anywhere.
-            sample=replace(model.sample, sums="window"),
         ),
         train=replace(
             small.train, start_from="tiny", steps=2500, optimizer=replace(small.train.optimizer, learning_rate=3e-3)
@@ -151,8 +149,7 @@ def roboscape_tiny() -> Config:
             ),
             compute_dtype="bfloat16",
             corruption=None,
-            # Every episode begins with the arm at rest.
-            sample=SampleConfig(steps=1, mean_codes=True, read_means=True, sums="clip"),
+            sample=SampleConfig(steps=1, mean_codes=True, read_means=True),
         ),
         train=TrainConfig(
             steps=1700,

@@ -20,7 +20,8 @@ TABLETOP_TASKS = ("cube", "can", "bread", "milk")  # which of the objects on the
 
 
 EXPERT = "expert"  # the scripted expert, the only one of the recipes that Meta-World has too
-RECIPES = (EXPERT, "grasps", "pushes", "slips", "driving", "novices", "midway", "heights")
+MIDWAY = "midway"  # the recipe whose clips begin in the middle of an episode
+RECIPES = (EXPERT, "grasps", "pushes", "slips", "driving", "novices", MIDWAY, "heights")
 RECORDED = "recorded:"  # precedes the path of a store of a policy's recorded episodes
 
 
@@ -100,6 +101,11 @@ class SimConfig:
         """The recipes' shares of the training episodes, which sum to 1."""
         shares = dict(map(_parted, self.recipe))
         return {name: share / sum(shares.values()) for name, share in shares.items()}
+
+    @property
+    def one_start(self) -> bool:
+        """Whether all clips begin where an episode does, with the robot in one place."""
+        return MIDWAY not in self.shares
 
     @property
     def train_tasks(self) -> tuple[str, ...]:

@@ -182,10 +182,6 @@ class SampleConfig:
     # Learned positions only: when the window is full, its first window_stride frames are dropped and the others encoded
     # again from position 0. A smaller stride gives a longer memory and more work. 0: half of the positions.
     window_stride: int = 0
-    # Where the sums of model.departures.integrate_actions begin once the window has moved. window: at its first frame,
-    # as in a clip that begins there. clip: at the clip's first frame; right for a model all of whose training clips
-    # begin with the robot in one place, since it knows the robot's place by these sums alone.
-    sums: Literal["window", "clip"] = later("window")
     cache_dtype: Literal["float32", "bfloat16"] = "float32"  # of temporal keys and values; bfloat16 halves the memory
     seed: int = 0  # of the draws; another one gives other videos of the same clips
     keep_still: KeepStillConfig | None = later(None)  # on for fixed cameras and tokenizers that blur

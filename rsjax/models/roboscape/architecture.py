@@ -39,6 +39,9 @@ class Architecture(TransformerConfig):
             (:mod:`rsjax.models.roboscape.departures.state_heads`).
         second_view: whether the RGB branch also reads tokens of a second view, and a head on it predicts them
             (:mod:`rsjax.models.roboscape.departures.second_view`).
+        one_start: whether all training clips begin where an episode does, with the robot in one place. The network may
+            then know by the sums of actions alone where the robot is, so in generation these go on when the window
+            moves (:func:`rsjax.models.roboscape.sample.sums_before`).
         feature_dtype: of the features between layers; :func:`rsjax.models.roboscape.transformer.run_transformer` sets
             it, and :func:`rsjax.models.roboscape.sample.written_out`.
     """
@@ -56,6 +59,7 @@ class Architecture(TransformerConfig):
     motion_head: bool = False
     state_heads: bool = False
     second_view: bool = False
+    one_start: bool = False
     feature_dtype: Literal["float32", "bfloat16"] = "float32"
 
     def __post_init__(self) -> None:
@@ -100,6 +104,7 @@ class Architecture(TransformerConfig):
             motion_head=model.keypoint_term == "motion",
             state_heads=model.state_heads is not None,
             second_view=config.second_view,
+            one_start=config.data is None and config.sim.one_start,
         )
 
     @property

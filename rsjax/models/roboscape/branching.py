@@ -178,7 +178,7 @@ class TokenBranching:
         """Returns the state of one clip after its first frame."""
         hidden = jnp.ones(1, bool) if self._arch.depth != "none" and not self._has_depth else None
         actions = jnp.zeros((1, 1, self._arch.action_inputs))
-        resting = resting_actions(self._arch, sample, self._codec.normalization)
+        resting = resting_actions(self._arch, self._codec.normalization)
         state: State = self._place(_start(self._arch, sample, self._params, tokens, actions, None, hidden, resting))
         return state
 

@@ -105,7 +105,7 @@ class TokenImagination:
             these = rows[lanes]
             cells = {name: grid[these] for name, grid in tokens.items()}
             sample = self._config.sample
-            resting = resting_actions(self._arch, sample, self._codec.normalization)
+            resting = resting_actions(self._arch, self._codec.normalization)
             fresh = _start(self._arch, sample, self._params, cells, draws[these], hidden, resting)
             if old is None:
                 self._states[number] = fresh

@@ -182,7 +182,7 @@ class RoboScape(WorldModel[Batch]):
         tokens, has_depth = self._tokens(assets, prompt, arch)
         tokens, inputs = divide((tokens, self._action_inputs(assets, actions)), params)
         key = jax.random.key(sample.seed)
-        resting = resting_actions(arch, sample, assets.normalization)
+        resting = resting_actions(arch, assets.normalization)
         made = rollout(arch, sample, params, tokens, inputs, key, index=index, no_depth=~has_depth, resting=resting)
         return self._video(assets, made, has_depth & depth, prompt, tokens)
 
@@ -198,7 +198,7 @@ class RoboScape(WorldModel[Batch]):
     ) -> Video:
         """Encodes the prompt once, and continues it under every action sequence.
 
-        With ``model.sample.sums`` "clip", sums of actions go on from ``past``.
+        Sums of actions go on from ``past`` where all training clips begin where an episode does.
 
         Raises:
             ValueError: the candidates' actions into the prompt's frames differ.
@@ -211,7 +211,7 @@ class RoboScape(WorldModel[Batch]):
             raise ValueError(f"the candidates' actions differ in rows before {seen}, which led into the one prompt")
         tokens, has_depth = self._tokens(assets, prompt, arch)
         inputs = self._action_inputs(assets, actions)
-        resting = resting_actions(arch, sample, assets.normalization)
+        resting = resting_actions(arch, assets.normalization)
         if past is not None and resting is not None:
             scaled = assets.normalization.scaled(past) - assets.normalization.scaled(np.zeros_like(past))
             inputs += with_sums(np.zeros(scaled.shape[-1:]), scaled.sum(0))
@@ -245,7 +245,7 @@ class RoboScape(WorldModel[Batch]):
             tokens["depth"] = jnp.zeros_like(tokens["rgb"])
         tokens, inputs = divide((tokens, self._action_inputs(assets, actions)), params)
         sample = self.config.sample
-        resting = resting_actions(arch, sample, assets.normalization)
+        resting = resting_actions(arch, assets.normalization)
         return score_tokens(arch, sample, params, tokens, inputs, ~has_depth, prompt_frames, resting)
 
     def pretrained_shapes(self, directory: Path) -> Params:

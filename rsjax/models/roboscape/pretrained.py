@@ -30,7 +30,7 @@ HEAD_JOINING = ("depth_embed/", "depth_previous_embed/")
 SECOND_JOINING = (f"{SECOND}_embed/", f"{SECOND}_previous_embed/")
 OPTIONAL = {"motion_head", "state_heads"}  # parameters that are left out where this model lacks them
 # Fields that may differ.
-FREE = {"action_encoder", "action_inputs", "motion_head", "state_heads", "departures"} | {
+FREE = {"action_encoder", "action_inputs", "motion_head", "state_heads", "one_start", "departures"} | {
     "compute_dtype",
     "feature_dtype",
     *(field.name for field in fields(TransformerConfig) if field.metadata.get("runtime")),

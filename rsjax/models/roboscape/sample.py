@@ -65,7 +65,7 @@ class State:
         readings: what the state heads read from the last frame; None: the model has none.
         features: the RGB branch's features of the last frame in its first pass, which sees none of its cells, as means
             over the cells; None: not requested.
-        resting: the actions of a frame of rest; None: sums begin at the window's first frame (``sample.sums``).
+        resting: the actions of a frame of rest; None: sums begin at the window's first frame.
     """
 
     tokens: dict[str, Int[Array, "B K S"]]
@@ -396,11 +396,9 @@ def unread(arch: Architecture) -> int:
     return arch.uncommitted
 
 
-def resting_actions(
-    arch: Architecture, sample: SampleConfig, normalization: Normalization
-) -> Float[Array, " A"] | None:
+def resting_actions(arch: Architecture, normalization: Normalization) -> Float[Array, " A"] | None:
     """Returns the actions of a frame of rest if sums begin at the clip's first frame; None: at the window's."""
-    if sample.sums == "window" or not arch.departures.integrate_actions:
+    if not arch.one_start or not arch.departures.integrate_actions:
         return None
     return jnp.asarray(normalization.resting())
 

@@ -57,8 +57,6 @@ class Options:
     model.text.dropout or a file."""
     window_stride: int | None = None
     """Frames by which a full window moves on (with learned positions); 0: half of the window."""
-    sums: Literal["window", "clip"] | None = None
-    """Where sums of actions begin once the window has moved: at its first frame, or at the clip's."""
     cache_dtype: Literal["float32", "bfloat16"] | None = None
     """Data type of the cache of keys and values."""
     seed: int | None = None

@@ -200,7 +200,7 @@ def finetuned(
         departures=departures,
         state_heads=None,
         backwards=backwards,
-        sample=replace(model.sample, keep_still=kept, sums="window"),  # recordings begin anywhere
+        sample=replace(model.sample, keep_still=kept),
     )
     own = config.tokenizer_train
     patience = settings.patience

@@ -16,6 +16,7 @@ from tests.models.roboscape.toy_sample import BATCH, DUAL, KEY, RGB, SMALL, give
 
 SUMS = depart(replace(DUAL, action_inputs=4), integrate_actions=True, read_previous=True)
 GUIDED = depart(RGB, action_dropout=0.1, rotary=True, read_previous=True)
+ONE_START = depart(replace(SUMS, one_start=True), whole_frames=True)
 FRAMES = 15
 
 
@@ -27,7 +28,7 @@ FRAMES = 15
         (SUMS, SampleConfig(steps=2, mean_codes=True, read_means=True)),
         (depart(SMALL, read_previous=True), SampleConfig(steps=2, window_stride=2)),
         (depart(SUMS, whole_frames=True), SampleConfig(steps=1, mean_codes=True, read_means=True, window_stride=2)),
-        (depart(SUMS, whole_frames=True), SampleConfig(steps=1, temperature=1.0, window_stride=5, sums="clip")),
+        (ONE_START, SampleConfig(steps=1, temperature=1.0, window_stride=5)),
         (depart(GUIDED, whole_frames=True), SampleConfig(steps=1, guidance=2.0)),
     ],
     ids=[
@@ -45,7 +46,7 @@ def test_stepping_recomputes_a_rollout_though_clips_begin_at_different_times(
 ) -> None:
     params, (tokens, actions) = random_params(model), given(model, 1, FRAMES)
     resting = None
-    if sample.sums == "clip":
+    if model.one_start:
         resting = jnp.linspace(-0.5, 0.5, model.action_inputs)
     expected = rollout(model, sample, params, tokens, actions, KEY, cached=False, resting=resting)
     late = 4

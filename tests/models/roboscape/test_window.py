@@ -52,9 +52,9 @@ def test_sums_that_go_on_say_where_a_clip_that_moved_as_far_within_the_window_wo
     units = Normalization((0.1, -0.2), (0.5, 2.0), (0.0, 1.0))
     whole = units.action_inputs(raw, integrate=True)
     base = 3
-    resting = resting_actions(SUMS, SampleConfig(sums="clip"), units)
-    assert resting_actions(SUMS, SampleConfig(), units) is None
-    assert resting_actions(RGB, SampleConfig(sums="clip"), units) is None
+    resting = resting_actions(replace(SUMS, one_start=True), units)
+    assert resting_actions(SUMS, units) is None
+    assert resting_actions(replace(RGB, one_start=True), units) is None
     before = sums_before(whole[:, base], base, resting)
     seen = window_actions(SUMS, whole[:, base:], before, 0)
     short = raw[:, base:].copy()

@@ -282,8 +282,7 @@ def test_sums_of_actions_go_on_from_those_before_the_prompt(tmp_path: Path) -> N
     clips = toy.store(tmp_path / "clips")
     config = toy.config()
     departures = replace(config.model.departures, integrate_actions=True)
-    sample = replace(config.model.sample, sums="clip")
-    trained = toy.trained(clips, toy.with_model(config, departures=departures, sample=sample))
+    trained = toy.trained(clips, toy.with_model(config, departures=departures))
     rng = np.random.default_rng(0)
     rgb, rows = toy.clip(0).rgb[:1], rng.normal(0, 0.4, (1, 3, 28)).astype(np.float32)
     inputs = trained.params, trained.assets, Video(rgb[None]), rows
