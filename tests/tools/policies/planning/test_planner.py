@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from rsjax.clip import Video
-from rsjax.config import ConfigError, StateHeadsConfig
+from rsjax.config import ConfigError, RoboScapeConfig, StateHeadsConfig
 from rsjax.data.normalization import Normalization
 from rsjax.data.store import Store
 from rsjax.errors import UserError
@@ -122,7 +122,7 @@ def test_a_planner_acts_in_frames_with_and_without_depth() -> None:
             [1, 2, 2] if depths else [None] * 3
         )
         assert [seen.actions[-1, 0] for seen in asked] == [0, 1, 2]
-    assert [seen.past[:, 0].tolist() for seen in asked] == [[], [], [1]]
+    assert [np.asarray(seen.past)[:, 0].tolist() for seen in asked] == [[], [], [1]]
 
 
 def test_energies_are_scores_of_what_a_model_generates() -> None:
@@ -281,6 +281,7 @@ def test_a_comparison_resumes_and_counts(model: TrainedModel, tmp_path: Path, mo
 def test_sums_of_actions_go_on_from_those_before_the_prompt(tmp_path: Path) -> None:
     clips = toy.store(tmp_path / "clips")
     config = toy.config()
+    assert isinstance(config.model, RoboScapeConfig)
     departures = replace(config.model.departures, integrate_actions=True)
     trained = toy.trained(clips, toy.with_model(config, departures=departures))
     rng = np.random.default_rng(0)
