@@ -100,6 +100,7 @@ def test_a_dual_model_starts_from_a_dual_model_to_the_letter(tmp_path: Path) -> 
     saved = random_params(DUAL)
     save(tmp_path, DUAL, saved)
     jax.tree.map(np.testing.assert_array_equal, begin(DUAL, tmp_path), saved)
+    jax.tree.map(np.testing.assert_array_equal, begin(replace(DUAL, one_start=True), tmp_path), saved)
     (tmp_path / "empty").mkdir()
     for other, place, message in (
         (ALONE, tmp_path, "depth is branch there, none here"),

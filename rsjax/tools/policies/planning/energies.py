@@ -78,7 +78,7 @@ def _planned(model: TrainedModel, recent: RecentFrames, candidates: Float[np.nda
     prompt = Video(recent.rgb[None], None if recent.depth is None else recent.depth[None])
     actions = np.concatenate([before, candidates], axis=1)
     last = min(frames, candidates.shape[1])
-    return model.model.plan(model.params, model.assets, prompt, actions, depth=False, last=last, past=seen.past)
+    return model.model.plan(model.params, model.assets, prompt, actions, depth=False, last=last, past=recent.past)
 
 
 def pixel_distance(goal: UInt8[np.ndarray, "S S 3"]) -> Score:
