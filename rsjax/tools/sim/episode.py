@@ -216,7 +216,7 @@ def run_episode(sim: Simulator, config: SimConfig, plan: EpisodePlan) -> Clip:
         act = _replayed(plan.replay, CONTROLS[config.env], np.random.default_rng([seed, episode, 4]))
         manner = plan.replay.expert or manner
     for _ in range(plan.lead * config.control_steps):
-        sim.step(act(sim.state))
+        sim.step(np.asarray(act(sim.state), np.float32))  # rounded as recorded ones are
     views = []
     seconds = []
     shots = []

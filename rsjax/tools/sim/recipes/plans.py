@@ -41,7 +41,7 @@ RECIPES = {
     "slips": Recipe(slips.slips, 30_000_000),
     "driving": Recipe(driving.driving, 40_000_000),
     "novices": Recipe(novices.novices, 50_000_000),
-    "midway": Recipe(midway.midway, 60_000_000, lead=midway.LEAD),
+    "midway": Recipe(midway.midway, 60_000_000, lead=midway.LEAD, version=2),
     "heights": Recipe(heights.heights, 70_000_000, heights.GROUP),
 }
 

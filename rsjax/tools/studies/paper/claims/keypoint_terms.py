@@ -1,8 +1,9 @@
 """Keypoint terms beside that of Eq. 5, on a model whose second head predicts depth."""
 
+from collections.abc import Iterable, Mapping
 from typing import Any
 
-from rsjax.tools.studies.paper.claim import ESTIMATOR_ERROR, Arm, Claim, pairs, register
+from rsjax.tools.studies.paper.claim import ESTIMATOR_ERROR, Arm, ArmComparison, Claim, pairs, register
 
 _HEAD = {"model.depth": "head"}
 _TERMS: dict[str, dict[str, Any]] = {
@@ -13,21 +14,26 @@ _TERMS: dict[str, dict[str, Any]] = {
     "one normalised weight": {"model.loss.keypoint_weight": 0.0, "model.loss.attention": "normalised"},
 }
 
+
+def _with_and_without(terms: Mapping[str, Mapping[str, Any]]) -> tuple[Arm, ...]:
+    """Returns an arm without any term, and one with each of these."""
+    arms = [Arm("without", _HEAD | {"model.loss.keypoints": "none"})]
+    return (*arms, *(Arm(name, {**_HEAD, **values}) for name, values in terms.items()))
+
+
+def _against_without(terms: Iterable[str], *metrics: str) -> tuple[ArmComparison, ...]:
+    """Returns the comparisons of each term with none."""
+    return tuple(pair for name in terms for pair in pairs(name, "without", *metrics))
+
+
 register(
     Claim(
         name="keypoint-terms",
         title="Keypoint terms whose minimum is the truth",
         statement="A term on tracked points that the true video minimises makes moving regions better.",
         place="choices of ours beside Eq. 5 and 7",
-        arms=(
-            Arm("without", _HEAD | {"model.loss.keypoints": "none"}),
-            *(Arm(name, _HEAD | values) for name, values in _TERMS.items()),
-        ),
-        comparisons=tuple(
-            pair
-            for name in _TERMS
-            for pair in pairs(name, "without", "psnr_motion", "cube_error_widths", "gripper_error_widths", "psnr")
-        ),
+        arms=_with_and_without(_TERMS),
+        comparisons=_against_without(_TERMS, "psnr_motion", "cube_error_widths", "gripper_error_widths", "psnr"),
         shown=("delta_psnr", "lpips_alex", "depth_absrel_median_estimator", ESTIMATOR_ERROR),
         rank=3,
         notes=("All arms train for the same steps. The terms that are not in the paper come without Eq. 7.",),
@@ -46,13 +52,8 @@ register(
         title="Eq. 5 and Eq. 7, each alone and together",
         statement="Keypoint learning proves essential for both visual fidelity and action controllability.",
         place="§3.2, of Eq. 5 and Eq. 7 one by one",
-        arms=(
-            Arm("without", _HEAD | {"model.loss.keypoints": "none"}),
-            *(Arm(name, _HEAD | values) for name, values in _PRINTED.items()),
-        ),
-        comparisons=tuple(
-            pair for name in _PRINTED for pair in pairs(name, "without", "psnr", "psnr_motion", "delta_psnr")
-        ),
+        arms=_with_and_without(_PRINTED),
+        comparisons=_against_without(_PRINTED, "psnr", "psnr_motion", "delta_psnr"),
         shown=("cube_error_widths", "gripper_error_widths", "lpips_alex", "depth_absrel_median_estimator"),
         rank=5,
         notes=("All arms train for the same steps and predict depth by a second head.",),
@@ -70,15 +71,8 @@ register(
         title="One normalised weight, spent on moving or on contact cells",
         statement="A cross-entropy that counts the cells of things that are moved more brings them to the right place.",
         place="a choice of ours beside Eq. 7",
-        arms=(
-            Arm("without", _HEAD | {"model.loss.keypoints": "none"}),
-            *(Arm(name, _HEAD | values) for name, values in _WEIGHTS.items()),
-        ),
-        comparisons=tuple(
-            pair
-            for name in _WEIGHTS
-            for pair in pairs(name, "without", "cube_error_widths", "gripper_error_widths", "psnr_motion", "psnr")
-        ),
+        arms=_with_and_without(_WEIGHTS),
+        comparisons=_against_without(_WEIGHTS, "cube_error_widths", "gripper_error_widths", "psnr_motion", "psnr"),
         shown=("delta_psnr", "lifted_accuracy", "lpips_alex", "depth_absrel_median_estimator"),
         rank=5,
         notes=("All arms train for the same steps. Contact cells are those of points that rest before they move.",),
