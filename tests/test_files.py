@@ -241,7 +241,7 @@ def test_a_changed_digit_of_sealed_numbers_is_refused(tmp_path: Path) -> None:
             Normalization.load(tmp_path)
         assert "its checksum is wrong" in str(raised.value)
     values = json.loads(whole)
-    del values["crc32"]  # as files of older versions
+    del values["crc32"]  # as who edits it on purpose does
     path.write_text(json.dumps(values))
     assert Normalization.load(tmp_path) == saved
 

@@ -37,14 +37,6 @@ def sampling(default: Any) -> Any:
     return field(default=default, metadata={"sampling": True})
 
 
-def later(default: Any) -> Any:
-    """Returns a dataclass field that older versions did not have; content keys leave it out at its default.
-
-    So what they made keeps its key.
-    """
-    return field(default=default, metadata={"later": True})
-
-
 def sampling_settings(config: Any) -> tuple[Any, ...]:
     """Returns the values of a config's fields made with :func:`sampling`."""
     return tuple(getattr(config, f.name) for f in dataclasses.fields(config) if f.metadata.get("sampling"))
@@ -164,7 +156,6 @@ def from_dict(kind: type[T], values: dict[str, Any]) -> T:
     hints = {f.name: declared[f.name] for f in dataclasses.fields(typing.cast(Any, kind))}
     if "kind" not in hints and hasattr(kind, "kind"):
         values = {name: value for name, value in values.items() if name != "kind"}
-    values = {name: value for name, value in values.items() if name not in getattr(kind, "retired", ())}
     unknown = set(values) - set(hints)
     require(not unknown, f"{kind.__name__} has no field {', '.join(sorted(unknown))}; the file is of another version")
     return kind(**{name: _read(f"{kind.__name__}.{name}", hints[name], value) for name, value in values.items()})
@@ -221,8 +212,7 @@ def content_key(*parts: Any) -> str:
     """Returns 16 hex digits that change exactly when the results of ``parts`` would.
 
     Args:
-        parts: config dataclasses (runtime and sampling fields are left out, as are those of :func:`later` at their
-            defaults), strings or numbers.
+        parts: config dataclasses (runtime and sampling fields are left out), strings or numbers.
     """
     return hashlib.sha256(json.dumps([_content(p) for p in parts], sort_keys=True).encode()).hexdigest()[:16]
 
@@ -232,6 +222,5 @@ def _content(part: Any) -> Any:
         return [_content(item) for item in part]
     if not dataclasses.is_dataclass(part):
         return part
-    deciding = [f for f in dataclasses.fields(part) if not f.metadata.keys() & {"runtime", "sampling"}]
-    kept = [f.name for f in deciding if "later" not in f.metadata or getattr(part, f.name) != f.default]
-    return {"": type(part).__name__} | {name: _content(getattr(part, name)) for name in kept}
+    deciding = [f.name for f in dataclasses.fields(part) if not f.metadata.keys() & {"runtime", "sampling"}]
+    return {"": type(part).__name__} | {name: _content(getattr(part, name)) for name in deciding}

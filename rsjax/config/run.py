@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 from rsjax.config.data import ClipShape, DataConfig
 from rsjax.config.fields import check_numbers, require, require_range
@@ -21,8 +21,6 @@ SIMULATOR_STEPS = 2000  # its training steps
 @dataclass(frozen=True)
 class EvalConfig:
     """Settings of the evaluation on the test split."""
-
-    retired: ClassVar[tuple[str, ...]] = ("report_clips",)  # fields that a file of an earlier version may have
 
     clips: int = 20  # clips that are scored, spread evenly over the test split
     repetitions: int = 1  # how often each clip is generated, with different random draws

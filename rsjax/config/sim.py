@@ -2,10 +2,10 @@
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Literal
 
 from rsjax.config.data import ClipShape
-from rsjax.config.fields import later, require, require_range
+from rsjax.config.fields import require, require_range
 from rsjax.config.metaworld import ML45, ML45_UNSEEN, TASKS
 from rsjax.errors import did_you_mean
 
@@ -29,8 +29,6 @@ RECORDED = "recorded:"  # precedes the path of a store of a policy's recorded ep
 class SimConfig:
     """Episodes collected in a simulator (:mod:`rsjax.tools.sim`)."""
 
-    retired: ClassVar[tuple[str, ...]] = ("workers",)  # fields that a file of an earlier version may have
-
     episodes: int = 200  # those of the test split included; more where training clips are learned by heart
     test_episodes: int = 20  # the last ones collected, never used in training
     frames: int = 16  # of a clip, as in the paper
@@ -49,9 +47,9 @@ class SimConfig:
     unseen_tasks: tuple[str, ...] = ()  # for the protocol "unseen"; none: in Meta-World the 5 that ML45 holds out
     # What the training episodes show, each with its share: expert, grasps, heights, pushes, slips, driving, novices,
     # midway, or recorded:PATH, such as expert=0.6 grasps=0.4. The test split is the expert's, whatever the recipe.
-    recipe: tuple[str, ...] = later((EXPERT,))
+    recipe: tuple[str, ...] = (EXPERT,)
     # wrist: each frame also has the picture of the camera on the Panda's hand, of the same size, without depth.
-    second_view: Literal["off", "wrist"] = later("off")
+    second_view: Literal["off", "wrist"] = "off"
 
     def __post_init__(self) -> None:
         require(self.frames >= 2, f"sim.frames is {self.frames}; a clip needs at least 2 frames")

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 from rsjax.config.data import ClipShape
-from rsjax.config.fields import later, loss_weights, require, require_range, runtime, sampling
+from rsjax.config.fields import loss_weights, require, require_range, runtime, sampling
 from rsjax.config.model import ModelConfig, register_family
 
 ActionEncoder = Literal["linear", "mlp", "norms", "none"]
@@ -184,7 +184,7 @@ class SampleConfig:
     window_stride: int = 0
     cache_dtype: Literal["float32", "bfloat16"] = "float32"  # of temporal keys and values; bfloat16 halves the memory
     seed: int = 0  # of the draws; another one gives other videos of the same clips
-    keep_still: KeepStillConfig | None = later(None)  # on for fixed cameras and tokenizers that blur
+    keep_still: KeepStillConfig | None = None  # on for fixed cameras and tokenizers that blur
 
     def __post_init__(self) -> None:
         require(self.steps >= 1, f"model.sample.steps is {self.steps}; a frame needs at least 1 decoding step")
@@ -312,7 +312,7 @@ class TokenModelConfig(TransformerConfig, ModelConfig):
     max_frames: int = 0
     corruption: CorruptionConfig | None = CorruptionConfig()  # off: models of few steps lose more than they gain
     state_heads: StateHeadsConfig | None = None  # on where a model is to judge success itself
-    backwards: BackwardsConfig | None = later(None)  # on for few clips, in which a scene seldom moves both ways
+    backwards: BackwardsConfig | None = None  # on for few clips, in which a scene seldom moves both ways
     sample: SampleConfig = sampling(SampleConfig())  # how frames are generated; may change after training
 
     def __post_init__(self) -> None:
@@ -401,7 +401,7 @@ class DepthHead:
     kind: ClassVar[Literal["head"]] = "head"
     # Whether the network reads depth tokens, true ones in training and its own in generation. False: it reads RGB's
     # alone, and generation without depth leaves the head out, which changes no token of RGB.
-    feed_back: bool = later(True)
+    feed_back: bool = True
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,10 @@
 """Settings of the training loop and its optimizer."""
 
 import math
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from typing import ClassVar, Literal
 
-from rsjax.config.fields import later, require, require_range, runtime
+from rsjax.config.fields import require, require_range, runtime
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ class ComponentConfig:
     clips: int = 0  # use only this many of these clips, the first ones; 0: all
     # Depth and tracks to learn from: own, the clips' own; or for the world model on this run's own clips, tracks by
     # Lucas–Kanade, depth by a network trained on other clips, or both (rsjax.tools.pipeline.estimated_annotations).
-    annotations: Literal["own", "estimated_tracks", "estimated_depth", "estimated"] = later("own")
+    annotations: Literal["own", "estimated_tracks", "estimated_depth", "estimated"] = "own"
 
     def __post_init__(self) -> None:
         require(
@@ -110,7 +110,7 @@ class CurriculumStageConfig:
     # The learning rate schedule starts again with this stage; it ends at the next restart or the end of the run.
     restart: bool = False
     # Train on this many of each clip's frames, the first ones, which is cheaper; 0: all. Only families of tokens.
-    frames: int = later(0)
+    frames: int = 0
 
     def __post_init__(self) -> None:
         require(self.epochs > 0, f"a curriculum's stage has {self.epochs} epochs; it must have more than 0")
@@ -156,7 +156,7 @@ class TrainConfig:
     # a change of it). Empty: all clips of this run for ``steps`` steps. On the command line: a file of JSON.
     curriculum: tuple[CurriculumStageConfig, ...] = ()
     # On: validates as it says, in place of runtime.eval_every, and uses the best weights, not the last ones.
-    early_stop: EarlyStopConfig | None = field(default=None, metadata={"later": True})
+    early_stop: EarlyStopConfig | None = None
     accumulate: int = runtime(1)  # parts of a batch computed one after another; raise it where memory runs out
 
     def __post_init__(self) -> None:

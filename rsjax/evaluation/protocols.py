@@ -95,10 +95,7 @@ class Protocol:
             "scores": "predicted frames",
             "best of samples": "all frames, the prompt as the model sees it included",
         }
-        described = to_dict(self) | {"frames": frames if self.samples > 1 else {"scores": frames["scores"]}}
-        if not self.as_published:
-            del described["as_published"]  # which older results lack
-        return described
+        return to_dict(self) | {"frames": frames if self.samples > 1 else {"scores": frames["scores"]}}
 
 
 PAPER = Protocol(

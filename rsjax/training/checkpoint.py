@@ -237,7 +237,7 @@ def save_weights(path: Path, weights: PyTree) -> None:
 
 
 def load_weights(path: Path, like: Tree) -> Tree:
-    """Reads parameters that :func:`save_weights` wrote; those of older versions have no checksums to compare.
+    """Reads parameters that :func:`save_weights` wrote.
 
     Args:
         like: parameters of the same structure, or their shapes.
@@ -247,7 +247,7 @@ def load_weights(path: Path, like: Tree) -> Tree:
     """
     if not path.exists():
         raise CheckpointError(f"{path}: no such weights; train first (rsjax train)")
-    if (path / CHECKSUMS).exists() and (fault := find_fault(path)):
+    if fault := find_fault(path):
         raise _pointer(path) or CheckpointError(
             f"{path}: is damaged ({fault}); restore it from a copy, or delete it and make it again: a training makes "
             f"it from its last checkpoint"

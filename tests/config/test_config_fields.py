@@ -8,23 +8,8 @@ from hypothesis import strategies as st
 
 from rsjax.config import Config, ConfigError, content_key, from_dict, presets, to_dict
 from rsjax.config.config_fields import config_fields, with_sections, with_values
-from rsjax.config.fields import later
 
 DEBUG = presets.debug()
-
-
-@dataclasses.dataclass(frozen=True)
-class Older:
-    rate: float = 1.0
-
-
-@dataclasses.dataclass(frozen=True)
-class Newer:
-    rate: float = 1.0
-    word: str = later("own")
-
-
-Newer.__name__ = Older.__name__  # as a class of another version
 
 
 def flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -159,9 +144,3 @@ def test_the_fields_of_a_section_are_those_of_its_own_class() -> None:
     assert list(config_fields(Whole())) == ["model.width", "model.gamma"]
     assert list(config_fields(Whole(Base()))) == ["model.width"]
     assert with_values(Whole(), {"model.gamma": 2.0}) == Whole(Family(gamma=2.0))
-
-
-def test_a_later_field_leaves_the_keys_of_what_older_versions_made() -> None:
-    assert content_key(Newer(), 1) == content_key(Older(), 1)
-    assert content_key(Newer(2.0), 1) != content_key(Newer(), 1)
-    assert content_key(Newer(word="estimated"), 1) != content_key(Newer(), 1)

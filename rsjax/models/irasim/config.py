@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 from rsjax.config.data import ClipShape
-from rsjax.config.fields import later, loss_weights, require, require_range, runtime, sampling
+from rsjax.config.fields import loss_weights, require, require_range, runtime, sampling
 from rsjax.config.model import ModelConfig, register_family
 from rsjax.config.tokenizer import TokenizerConfig
 from rsjax.models.diffusion.config import DenoiseConfig, NoiseConfig, check_grid
@@ -71,7 +71,7 @@ class KLConfig:
     # Whether depth maps are encoded as well, and how their colours are spaced (rsjax/data/depth_color.py). The latents
     # of a frame's depth are then further channels of the frame's, which the transformer denoises together: the way of
     # Aether and TesserAct.
-    depth: Literal["none", "linear", "inverse"] = later("none")
+    depth: Literal["none", "linear", "inverse"] = "none"
     compute_dtype: Literal["float32", "bfloat16"] = "float32"  # of convolutions, as in TokenizerConfig
 
     def __post_init__(self) -> None:
@@ -118,7 +118,7 @@ class IRASimConfig(DiTConfig, ModelConfig):
     autoencoder: KLConfig = KLConfig()  # trained first, or converted
     action_dropout: float = 0.1  # share of the training clips whose actions are replaced by a learned embedding
     error_weight: float = 1.0  # of the squared error in the channels of RGB, all that there are without depth
-    depth_weight: float = later(1.0)  # of the squared error in the channels of depth
+    depth_weight: float = 1.0  # of the squared error in the channels of depth
     noise: NoiseConfig = NoiseConfig()  # the forward process
     sample: DenoiseConfig = sampling(DenoiseConfig())  # how clips are generated; may change after training
 

@@ -133,8 +133,8 @@ class RoboScape(WorldModel[Batch]):
             records = [record | {"success": None} for record in records]
         for name, count in missing_labels(records).items():
             note(
-                f"{clips.path}: {count} of {len(records)} training clips have no label of {name}, as recordings and "
-                f"episodes of older versions; model.state_heads learns {name} from the others alone"
+                f"{clips.path}: {count} of {len(records)} training clips have no label of {name}, as recordings "
+                f"have none; model.state_heads learns {name} from the others alone"
             )
 
     def prepare(self, clips: Store, assets: Assets, folder: Path, max_damaged: float) -> Store:

@@ -16,7 +16,6 @@ from rsjax.config import (
     TokenModelConfig,
     require,
 )
-from rsjax.config.fields import later
 from rsjax.data.clips import load_clips
 from rsjax.data.normalization import Normalization
 from rsjax.data.store import Store
@@ -72,8 +71,8 @@ class Finetuning:
     short_share: float = 0.0
     patience: int = -1
     seed: int = 0
-    keep_still: Literal["measure", "on", "off"] = later("measure")
-    backwards: Literal["measure", "on", "off"] = later("measure")
+    keep_still: Literal["measure", "on", "off"] = "measure"
+    backwards: Literal["measure", "on", "off"] = "measure"
 
     def __post_init__(self) -> None:
         require(self.steps >= -1, f"--steps is {self.steps}; give a number, or -1 for as many as suit the clips")

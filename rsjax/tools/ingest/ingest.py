@@ -205,7 +205,4 @@ def _plan_key(plan: IngestPlan, refs: Sequence[EpisodeRef]) -> str:
     digest = hashlib.sha256()
     for ref in refs:
         digest.update(plan.keys(ref)[CLIPS].encode())
-    shares = [plan.shares.test]
-    if plan.shares[1:] != (0.0, 0):  # otherwise the key is that of older versions
-        shares = list(plan.shares)
-    return content_key("ingest", digest.hexdigest(), *shares)
+    return content_key("ingest", digest.hexdigest(), *plan.shares)

@@ -68,11 +68,10 @@ def _figure(result: Evaluation, row: int, config: Config) -> ClipFigure:
     title = f"{label}: {shown['task'][row] or 'no task named'}"
     if shown["success"].any():  # otherwise it may be unknown
         title += " (success)" if shown["success"][row] else " (failure)"
-    if "rank" in shown:  # not in files of earlier versions
-        rank = _rank(int(shown["rank"][row]), int(result.metrics["clips"]))
-        score = f"{shown['psnr'][row]:.1f} dB"
-        title = f"{title}, {rank}: {score}"
-        label = f"{rank.split(' of ')[0]}, {score}"
+    rank = _rank(int(shown["rank"][row]), int(result.metrics["clips"]))
+    score = f"{shown['psnr'][row]:.1f} dB"
+    title = f"{title}, {rank}: {score}"
+    label = f"{rank.split(' of ')[0]}, {score}"
     unit = "metres" if shown.get("metric", shown["has_depth"])[row] else "relative"
     return ClipFigure(title=title, prompt_frames=config.prompt_frames, depth_unit=unit, label=label, **arrays)
 

@@ -161,10 +161,12 @@ def _check_validation(path: Path, validation: dict[str, Any]) -> None:
     """Raises :class:`UserError` unless the parts of a validation have what results show of them."""
     count = len(LABELS)
     for kind in VALIDATED:
-        part = validation.get(kind, {"confusion": [[0] * count] * count, "right": [0.0], "calibration_error": 0.0})
+        if kind not in validation:
+            continue
+        part = validation[kind]
         try:
             confusion = np.asarray(part["confusion"], float)
-            shares = [rate[0] for rates in part.get("whole_clips", {}).values() for rate in rates.values()]
+            shares = [rate[0] for rates in part["whole_clips"].values() for rate in rates.values()]
             numbers = np.asarray([part["right"][0], part["calibration_error"], *shares], float)
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise UserError(f"{path}: its part {kind!r} is damaged ({error}); train the judge again") from error

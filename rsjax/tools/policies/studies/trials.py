@@ -127,7 +127,7 @@ def try_policy(
                     success=success, uninterpretable=uninterpretable, clipped=clipped, unfamiliarity=unfamiliarity
                 )
                 progress.update(len(success), success=sum(success))
-    if len(unfamiliarity) < len(success):  # episodes that an older version or another command has run
+    if len(unfamiliarity) < len(success):  # episodes that another command has run
         unfamiliarity = []
     return TrialResult(success, clipped, uninterpretable, unfamiliarity)
 

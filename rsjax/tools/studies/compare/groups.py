@@ -20,7 +20,7 @@ ALIKE = {
     "settings": None,
     "data": ("key", "split", "frames", "image_size", "fps"),
 }
-MAYBE_UNKNOWN = ("fps", "physics_iq_threshold", "second_take_jitter")  # None, as in older results, fits any value
+MAYBE_UNKNOWN = ("fps", "second_take_jitter")  # None, as for clips without times or second takes, fits any value
 SEEDED = ("family", "preset", "settings", "training")  # fields of a result's model that are equal within a group
 NOTED = {"sampling": None, "model": ("trained_on",), "code": ("revision", "diff_sha256")}
 
@@ -147,7 +147,7 @@ def check_seeds(group: Group) -> None:
     for model in (result.model for result in group.results):
         there = _deciding(first)
         here = _deciding(model)
-        pairs = {name: (there[name], here[name]) for name in there if name in here}  # older results lack some fields
+        pairs = {name: (there.get(name, "not set"), here.get(name, "not set")) for name in here | there}
         lines = [f"model.{name} is {a} in the first, {b} in the other" for name, (a, b) in pairs.items() if a != b]
         runs = f"{group.name}: {first['run']} and {model['run']}"
         require(not lines, f"{runs} differ in more than their seed: {'; '.join(lines)}; make them groups of their own")

@@ -136,10 +136,9 @@ def _chosen(comparison: Comparison, rows: Int[np.ndarray, " n"]) -> dict[int, st
     own = np.mean([each.per_clip["psnr"] for each in results], axis=0)
     still = np.array(results[0].per_clip["psnr_repeat_first"])
     every = np.arange(len(own))
-    pool = every if np.isin(np.concatenate(extremes(still)), rows).all() else rows  # older results lack the ends
     chosen: dict[int, str] = {}
     for scores, among, ends, of in (
-        (still, pool, ("moves most", "moves least"), "first frame repeated"),
+        (still, every, ("moves most", "moves least"), "first frame repeated"),
         (own, rows, ("worst", "best"), name),
     ):
         clips = f"{'all' if len(among) == len(every) else 'the'} {len(among)}{'' if among is every else ' kept'} clips"

@@ -112,7 +112,8 @@ def test_a_judge_of_impossible_content_is_refused(judge: TrainedJudge, tmp_path:
     path.unlink()
     judge.save(folder)
     good = {"confusion": [[1, 0, 0], [0, 1, 0], [0, 0, 0]], "right": [1.0, 0.5, 1.0], "calibration_error": 0.1}
-    for part in (None, 7, good | {"confusion": [[1]]}, good | {"right": None}, good | {"calibration_error": "x"}):
+    good["whole_clips"] = {"1": {"false_success": [0.5, 0.2, 0.8]}}
+    for part in (None, 7, good | {"confusion": [[1]]}, good | {"right": None}, good | {"whole_clips": 3}):
         (folder / "validation.json").write_text(json.dumps({"judge": judge.key, "raw": part}))
         with pytest.raises(UserError) as raised:
             load_judge(folder)

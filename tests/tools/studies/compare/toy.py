@@ -13,7 +13,6 @@ rng = np.random.default_rng(0)
 DIFFICULTY = rng.normal(0, 3, CLIPS)  # of each clip, for every model
 ENDS = np.argsort(DIFFICULTY)[[0, 1, 2, -3, -2, -1]]  # the clips in which most and least moves
 ROWS = np.union1d(np.arange(0, CLIPS, 7), ENDS)
-SPREAD = np.flatnonzero(np.isin(ROWS, np.setdiff1d(np.arange(0, CLIPS, 7), ENDS)))  # places of the rows between them
 TRUTH = rng.integers(0, 256, (len(ROWS), FRAMES, SIZE, SIZE, 3), np.uint8)
 
 
