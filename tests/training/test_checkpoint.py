@@ -148,8 +148,9 @@ def test_a_flipped_bit_in_weights_is_refused_wherever_it_is(tmp_path: Path) -> N
         file.write_bytes(content)
     load_weights(path, weights)
     (path / module.CHECKSUMS).unlink()
-    with pytest.raises(CheckpointError, match="is damaged"):
+    with pytest.raises(CheckpointError) as raised:
         load_weights(path, weights)
+    assert str(raised.value).startswith(f"{path}: is damaged (")
 
 
 def test_weights_that_are_missing_other_or_damaged_are_named(tmp_path: Path) -> None:
