@@ -149,6 +149,12 @@ class Config:
         return self.data is None and self.sim.second_view != "off"
 
     @property
+    def one_start(self) -> bool:
+        """Whether all training clips begin where an episode does, with the robot in one place, as far as is known."""
+        components = [each for stage in self.train.curriculum for each in stage.components]
+        return self.data is None and self.sim.one_start and not any(each.store for each in components)
+
+    @property
     def autoencoder(self) -> Any:
         """Settings of the network that maps frames to tokens or latents: the model's own, or ``tokenizer``."""
         own = self.model.own_autoencoder

@@ -97,6 +97,14 @@ def test_shares_of_a_recipe_sum_to_one() -> None:
     assert mixed.shares == {"expert": 0.625, "recorded:runs/a=b/episodes": 0.125, "grasps": 0.25}
 
 
+def test_clips_of_another_store_and_those_that_begin_midway_may_begin_anywhere() -> None:
+    assert BASE.one_start
+    mixed = c.CurriculumStageConfig((c.ComponentConfig(), c.ComponentConfig(store="policys-clips")))
+    assert not with_values(BASE, {"train.curriculum": (mixed,)}).one_start
+    assert not with_values(BASE, {"sim.recipe": ("expert", "midway")}).one_start
+    assert not Architecture.create(with_values(BASE, {"train.curriculum": (mixed,)})).one_start
+
+
 def test_a_stored_configuration_with_an_unknown_field_is_refused_by_name() -> None:
     plain = c.to_dict(BASE)
     plain["train"]["optimizer"]["momentum"] = 0.9

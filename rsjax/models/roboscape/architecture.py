@@ -104,7 +104,7 @@ class Architecture(TransformerConfig):
             motion_head=model.keypoint_term == "motion",
             state_heads=model.state_heads is not None,
             second_view=config.second_view,
-            one_start=config.data is None and config.sim.one_start,
+            one_start=config.one_start,
         )
 
     @property
