@@ -14,7 +14,7 @@ from rsjax.data.store import Store, write_store
 from rsjax.errors import UserError
 from rsjax.evaluation.metrics.psnr import psnr
 from rsjax.evaluation.registry import metrics
-from rsjax.files import read_json, write_file
+from rsjax.files import read_json, write_file, write_json
 from rsjax.model_directory import CARD, CLIPS, Dtype
 from rsjax.models.card import LIMITS, model_card
 from rsjax.models.load_run import load
@@ -22,6 +22,7 @@ from rsjax.models.trained import TrainedModel
 from rsjax.tools.pipeline.provenance import read_starts
 from rsjax.tools.pipeline.run import Run
 
+METRICS = "metrics.json"  # of the run, and a copy in the saved model, from which play says how far to trust it
 BATCH = 16  # clips that are generated at once to measure the loss of half precision
 SCORES = ("psnr", "psnr_motion", "delta_psnr", "ssim", "lpips_alex", "depth_absrel", "cube_error_widths")
 ROWS = {"": "prediction", "_repeat_first": "first frame repeated", "_tokenizer": "tokenizer's reconstruction"}
@@ -55,13 +56,14 @@ def publish(run: Run, out: Path, what: Publication) -> str:
     Raises:
         UserError: the run is unfinished or its clips are missing, or ``out`` holds something else.
     """
-    scores = read_json(run.directory / "metrics.json", cure="the train command of this run makes it")
+    scores = read_json(run.directory / METRICS, cure="the train command of this run makes it")
     starts = read_starts(run.directory)
     if not starts:
         raise UserError(f"{run.directory}: has no run.json, so nothing says what made it; train it with rsjax train")
     trained = load(run.directory)
     store = run.open_clips()
     trained.save(out, what.dtype)
+    write_json(out / METRICS, scores)
     numbers = write_excerpt(store, out / CLIPS, what.clips)
     lost = "Nothing was measured with these weights."
     if what.measured:

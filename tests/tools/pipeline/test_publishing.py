@@ -15,6 +15,7 @@ from rsjax.clip import GENERATED_MARK
 from rsjax.data.clips import load_clips
 from rsjax.errors import UserError
 from rsjax.evaluation.results import read_result
+from rsjax.files import read_json
 from rsjax.model_directory import PRETRAINED, SHIPPED
 from rsjax.models.load_run import load_config
 from rsjax.tools.commands.evaluate import Options
@@ -82,6 +83,10 @@ def test_the_card_is_made_of_the_runs_records(published: Path) -> None:
     ):
         assert words in card, words
     assert "SSIM" not in card  # has no score
+
+
+def test_the_runs_scores_come_along(run: Run, published: Path) -> None:
+    assert read_json(published / "metrics.json") == read_json(run.directory / "metrics.json")
 
 
 def test_the_loss_of_rounding_is_the_difference_of_two_means(run: Run, published: Path) -> None:
