@@ -21,7 +21,7 @@ TABLETOP_TASKS = ("cube", "can", "bread", "milk")  # which of the objects on the
 
 EXPERT = "expert"  # the scripted expert, the only one of the recipes that Meta-World has too
 MIDWAY = "midway"  # the recipe whose clips begin in the middle of an episode
-RECIPES = (EXPERT, "grasps", "pushes", "slips", "driving", "novices", MIDWAY, "heights")
+RECIPES = (EXPERT, "grasps", "pushes", "slips", "driving", "novices", MIDWAY)
 RECORDED = "recorded:"  # precedes the path of a store of a policy's recorded episodes
 
 
@@ -45,7 +45,7 @@ class SimConfig:
     env: Literal["lift", "metaworld", "rope", "tabletop"] = "lift"
     tasks: tuple[str, ...] = ()  # none: the 45 training tasks of Meta-World's ML45, or all of another scene
     unseen_tasks: tuple[str, ...] = ()  # for the protocol "unseen"; none: in Meta-World the 5 that ML45 holds out
-    # What the training episodes show, each with its share: expert, grasps, heights, pushes, slips, driving, novices,
+    # What the training episodes show, each with its share: expert, grasps, pushes, slips, driving, novices,
     # midway, or recorded:PATH, such as expert=0.6 grasps=0.4. The test split is the expert's, whatever the recipe.
     recipe: tuple[str, ...] = (EXPERT,)
     # wrist: each frame also has the picture of the camera on the Panda's hand, of the same size, without depth.

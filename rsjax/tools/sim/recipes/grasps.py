@@ -1,7 +1,8 @@
 """Paired grasps: the same start and approach, then fingers that close at several distances from the cube.
 
 The position of the fingers alone decides whether a grasp succeeds, since the episodes of a group share everything else:
-start, speed, noise, and what follows the closing.
+start, height, speed, noise, and what follows the closing. Groups differ in height, because a model that has seen
+grasps at one height alone takes those a centimetre above it for misses.
 """
 
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ from rsjax.tools.sim.recipes.script import Moves, Scripted, See, go, hover, stay
 BESIDE = ((0.0, 0.018), (0.02, 0.03), (0.03, 0.04), (0.04, 0.055))
 ABOVE = ((0.0, 0.018), (0.019, 0.027), (0.027, 0.036), (0.036, 0.06))
 GROUP = len(BESIDE)
+HEIGHT = (-0.012, 0.018)  # above the cube's centre, where the fingers of a group close beside it
 ABOVE_SHARE = 0.25  # of the groups; the others close beside the cube
 
 
@@ -55,9 +57,11 @@ class GraspManner:
 def grasps(rng: np.random.Generator, number: int) -> GraspManner:
     """Draws a group of grasps, and returns one of it: its ``offset`` alone depends on the episode's number."""
     angle = rng.uniform(0, 2 * np.pi)
+    height = rng.uniform(*HEIGHT)
     if rng.random() < ABOVE_SHARE:
         intervals = np.array(ABOVE)
         direction = np.array([0, 0, 1])
+        height = -0.004
     else:
         intervals = np.array(BESIDE)
         direction = np.array([np.cos(angle), np.sin(angle), 0])
@@ -66,7 +70,7 @@ def grasps(rng: np.random.Generator, number: int) -> GraspManner:
     return GraspManner(
         mode="grasps",
         hover=float(rng.uniform(0.06, 0.1)),
-        offset=(float(x), float(y), float(z) - 0.004),
+        offset=(float(x), float(y), float(z + height)),
         speed=float(rng.uniform(0.75, 1.0)),
         noise=float(rng.uniform(0.0, 0.1)),
         delay=int(rng.integers(0, 4)),

@@ -10,7 +10,7 @@ import numpy as np
 from rsjax.config import SimConfig
 from rsjax.config.sim import EXPERT, RECORDED
 from rsjax.tools.sim.episode import EpisodePlan, Manner, task_of
-from rsjax.tools.sim.recipes import driving, grasps, heights, midway, novices, pushes, slips
+from rsjax.tools.sim.recipes import driving, grasps, midway, novices, pushes, slips
 from rsjax.tools.sim.recipes.recorded import recorded
 
 HELD_OUT = 5_000_000  # added to the numbers of episodes that training never sees
@@ -36,13 +36,12 @@ class Recipe:
 
 
 RECIPES = {
-    "grasps": Recipe(grasps.grasps, 10_000_000, grasps.GROUP),
+    "grasps": Recipe(grasps.grasps, 10_000_000, grasps.GROUP, version=2),
     "pushes": Recipe(pushes.pushes, 20_000_000),
     "slips": Recipe(slips.slips, 30_000_000),
     "driving": Recipe(driving.driving, 40_000_000),
     "novices": Recipe(novices.novices, 50_000_000),
     "midway": Recipe(midway.midway, 60_000_000, lead=midway.LEAD, version=2),
-    "heights": Recipe(heights.heights, 70_000_000, heights.GROUP),
 }
 
 
