@@ -129,7 +129,7 @@ class RoboScape(WorldModel[Batch]):
             return
         source = clips.source("train")
         records = [record for _, record in readable(source, spread(source, LABELLED_CLIPS))]
-        if not knows_success(clips):
+        if clips.manifest["kind"] == "clips" and not knows_success(clips):  # tokens have success only where it is known
             records = [record | {"success": None} for record in records]
         for name, count in missing_labels(records).items():
             note(

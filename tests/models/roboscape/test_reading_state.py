@@ -146,6 +146,16 @@ def test_labels_that_clips_lack_are_named(tmp_path: Path, capsys: pytest.Capture
     assert "label of success" not in told
 
 
+def test_success_is_known_of_tokens_that_carry_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    store = toy.store(tmp_path / "clips")
+    model = create_model(toy.with_model(toy.config(), state_heads=StateHeadsConfig()))
+    tokens = model.prepare(store, toy.assets(store), tmp_path, 0.0)
+    assert tokens is not None
+    capsys.readouterr()
+    model.check_clips(tokens)
+    assert "label of success" not in capsys.readouterr().out
+
+
 def test_a_model_without_heads_reads_nothing(clips: Store) -> None:
     plain = toy.trained(clips)
     clip = clips.source("test")[0]
