@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from rsjax.clip import Video
-from rsjax.config import Config, content_key, presets
+from rsjax.config import Config, presets
 from rsjax.config.config_fields import with_values
 from rsjax.data.depth_color import color_to_depth, depth_to_color
 from rsjax.data.normalization import Normalization
@@ -58,13 +58,6 @@ def video(store: Store) -> Video:
 
 def codec(config: KLConfig, store: Store) -> KLCodec:
     return KLCodec(config, toy.autoencoder_params(RGB), Normalization.create(store))
-
-
-def test_without_depth_the_family_keeps_its_content_keys() -> None:
-    """Those of commit 5ed1223, before it knew depth: finished runs stay finished."""
-    for name, key in {"irasim_tiny": "a51e9d60938fe9de", "irasim_xl": "a91b1bf60d086630"}.items():
-        config = presets.get(name)
-        assert content_key(config.autoencoder, config.tokenizer_train, config.model) == key
 
 
 def test_the_latents_of_rgb_are_as_without_depth_and_a_clip_without_depth_has_zeros(store: Store) -> None:
