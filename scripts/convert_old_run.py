@@ -29,6 +29,8 @@ def upgraded(config: dict[str, Any]) -> dict[str, Any]:
             upgrade_training(config[section])
     if config.get("data") and not config["data"]["key"]:
         config["data"] = None
+    config["sim"].pop("workers", None)  # of the run now, not of the simulator
+    config["eval"].pop("report_clips", None)
     model = config["model"]
     if model["family"] in ("roboscape", "genie") and "departures" not in model:
         upgrade_model(model)

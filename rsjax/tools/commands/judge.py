@@ -42,6 +42,6 @@ def main() -> None:
         folder = head_judge.FOLDER
     result = make(with_clips(options.run), options.data_dir, options.store, part(options, JudgeSettings))
     print(f"judge on {result['clips']} held-out clips: frames by label\n\n{as_markdown(confusion_table(result))}\n")
-    whole = as_markdown(whole_clips(result))
-    print(f"whole clips, by how many frames in a row must show success\n\n{whole}\n")
+    if whole := whole_clips(result):
+        print(f"whole clips, by how many frames in a row must show success\n\n{as_markdown(whole)}\n")
     print(options.run / folder)

@@ -147,17 +147,20 @@ def markdown(judge: dict[str, Any] | None) -> list[str]:
         rows.append([kind, *counts, f"{100 * part['right'][0]:.1f} %", f"{part['calibration_error']:.3f}"])
     kinds = as_markdown(Table(("video", *LABELS, "right", "calibration error"), rows))
     lines = ["", f"The judge on held-out clips (frames called {labels}, by what they are):", "", kinds]
-    whole = as_markdown(whole_clips(judge))
-    return [*lines, "", "Whole clips, by how many frames in a row must show success:", "", whole]
+    if whole := whole_clips(judge):
+        lines += ["", "Whole clips, by how many frames in a row must show success:", "", as_markdown(whole)]
+    return lines
 
 
-def whole_clips(result: dict[str, Any]) -> Table:
-    """Returns the :func:`outcomes` of a validation as a table."""
+def whole_clips(result: dict[str, Any]) -> Table | None:
+    """Returns the :func:`outcomes` of a validation as a table; None for a judge of whole videos."""
     rows = []
     for kind in KINDS:
-        for count, rates in result[kind]["whole_clips"].items() if kind in result else ():
+        for count, rates in result.get(kind, {}).get("whole_clips", {}).items():
             shares = [f"{100 * rates[name][0]:.1f} %" if name in rates else ABSENT for name in OUTCOMES]
             rows.append([kind, count, *shares])
+    if not rows:
+        return None
     return Table(("video", "frames", *(name.replace("_", " ") for name in OUTCOMES)), rows)
 
 

@@ -98,7 +98,9 @@ def test_a_validation_says_how_whole_clips_are_judged() -> None:
 
     result = validate(sure, Footage(some.rgb, np.zeros_like(some.success)))
     assert result["whole_clips"]["2"]["false_success"][0] == 1
-    assert len(whole_clips({"raw": result}).rows) == len(result["whole_clips"])
+    table = whole_clips({"raw": result})
+    assert table is not None and len(table.rows) == len(result["whole_clips"])
+    assert whole_clips({"raw": {"confusion": []}}) is None
 
 
 class Reading:
