@@ -1,8 +1,8 @@
 """Paired grasps: the same start and approach, then fingers that close at several distances from the cube.
 
 The position of the fingers alone decides whether a grasp succeeds, since the episodes of a group share everything else:
-start, height, speed, noise, and what follows the closing. Groups differ in height, because a model that has seen
-grasps at one height alone takes those a centimetre above it for misses.
+start, height, speed, noise, and what follows the closing. Groups differ in height, because a model that has seen most
+grasps at one height takes those a centimetre above it for misses.
 """
 
 from dataclasses import dataclass
