@@ -9,6 +9,7 @@ from jaxtyping import Array
 
 from rsjax.layers.attention import attend as plain
 from rsjax.layers.packed_attention import Over
+from tests.layers.kernels import INTERPRETED
 
 
 def reference(qkv: Array, over: Over) -> Array:
@@ -23,7 +24,7 @@ def assert_like_plain(attend: Any, over: Over, shape: tuple[int, ...], dtype: An
     """Asserts that values and gradients are right up to ``bound`` of the largest."""
     qkv = (2 * jax.random.normal(jax.random.key(0), shape)).astype(dtype)
     cotangent = jax.random.normal(jax.random.key(1), (*shape[:3], *shape[4:])).astype(dtype)
-    out, gradient = jax.vjp(lambda x: attend(x, over, interpret=True), qkv)
+    out, gradient = jax.vjp(lambda x: attend(x, over, interpret=INTERPRETED), qkv)
     true_out, true_gradient = jax.vjp(lambda x: reference(x, over), qkv.astype(jnp.float32))
     pairs = [(out, true_out), (gradient(cotangent)[0], true_gradient(cotangent.astype(jnp.float32))[0])]
     for value, truth in pairs:

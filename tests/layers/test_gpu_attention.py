@@ -1,4 +1,4 @@
-"""Tests of attention as one kernel a pass on GPUs: values and gradients, by Pallas' interpreter."""
+"""Tests of attention as one kernel a pass on GPUs: values and gradients, on the GPU, or else by Pallas' interpreter."""
 
 import jax
 import jax.numpy as jnp
@@ -8,6 +8,7 @@ import pytest
 from rsjax.layers.gpu.attention import attend, fits
 from rsjax.layers.packed_attention import Over
 from tests.layers.attention_reference import assert_like_plain
+from tests.layers.kernels import INTERPRETED, dtypes
 
 SHAPES = [
     ("cells", (2, 3, 16, 3, 2, 16)),
@@ -18,7 +19,7 @@ SHAPES = [
 
 
 @pytest.mark.parametrize(("over", "shape"), SHAPES)
-@pytest.mark.parametrize(("dtype", "bound"), [(jnp.float32, 2e-6), (jnp.bfloat16, 1e-2)])
+@pytest.mark.parametrize(("dtype", "bound"), dtypes(2e-6))
 def test_values_and_gradients_are_those_of_plain_attention(
     over: Over, shape: tuple[int, ...], dtype: jnp.dtype, bound: float
 ) -> None:
@@ -29,7 +30,7 @@ def test_values_and_gradients_are_those_of_plain_attention(
 def test_a_frame_does_not_change_the_frames_before_it() -> None:
     qkv = jax.random.normal(jax.random.key(0), (1, 16, 4, 3, 1, 16))
     changed = qkv.at[:, 9].add(1.0)
-    before, after = (attend(x, "frames", interpret=True) for x in (qkv, changed))
+    before, after = (attend(x, "frames", interpret=INTERPRETED) for x in (qkv, changed))
     np.testing.assert_array_equal(before[:, :9], after[:, :9])
     assert not np.array_equal(before[:, 9:], after[:, 9:])
 

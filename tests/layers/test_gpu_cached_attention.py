@@ -1,4 +1,4 @@
-"""Tests of attention over a cache as one kernel on GPUs: values, by Pallas' interpreter."""
+"""Tests of attention over a cache as one kernel on GPUs: values, on the GPU, or else by Pallas' interpreter."""
 
 from functools import partial
 from typing import Any
@@ -12,6 +12,7 @@ from rsjax.layers.attention import KeyValues, attend_cached
 from rsjax.layers.gpu.cached_attention import attend, fits
 from rsjax.layers.kernel_flops import kernel_flops
 from rsjax.layers.platform import attend_over_cache, for_all_platforms
+from tests.layers.kernels import INTERPRETED, dtypes
 
 SHAPE = (2, 2, 8, 3, 2, 32)
 SLOTS = 16
@@ -24,7 +25,7 @@ def operands(shape: tuple[int, ...], slots: int, dtype: Any) -> tuple[jax.Array,
     return qkv.astype(dtype), cache[0].astype(dtype), cache[1].astype(dtype)
 
 
-@pytest.mark.parametrize(("dtype", "bound"), [(jnp.float32, 2e-6), (jnp.bfloat16, 1e-2)])
+@pytest.mark.parametrize(("dtype", "bound"), dtypes(2e-6))
 @pytest.mark.parametrize(
     ("shape", "slots", "start", "window"),
     [
@@ -41,7 +42,7 @@ def test_values_are_those_of_plain_attention(
 ) -> None:
     assert fits(shape, slots)
     qkv, keys, values = operands(shape, slots, dtype)
-    out = attend(qkv, keys, values, start, window, interpret=True)
+    out = attend(qkv, keys, values, start, window, interpret=INTERPRETED)
     assert out.dtype == dtype
     exact = [x.astype(jnp.float32) for x in (qkv, keys, values)]
     truth = attend_cached(exact[0], KeyValues(*exact[1:]), start, window)
@@ -54,7 +55,7 @@ def test_clips_at_different_positions_are_attended_to_as_each_alone() -> None:
     starts = jnp.array([3, 9])
 
     def run(qkv: Any, keys: Any, values: Any, start: Any) -> Any:
-        return attend(qkv, keys, values, start, 16, interpret=True)
+        return attend(qkv, keys, values, start, 16, interpret=INTERPRETED)
 
     both = jax.jit(jax.vmap(run))(qkv, keys, values, starts)
     for i, start in enumerate(starts):

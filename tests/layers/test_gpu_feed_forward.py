@@ -1,4 +1,4 @@
-"""Tests of a wide MLP's kernels on GPUs: values and gradients, by Pallas' interpreter."""
+"""Tests of a wide MLP's kernels on GPUs: values and gradients, on the GPU, or else by Pallas' interpreter."""
 
 from typing import Any
 
@@ -10,6 +10,7 @@ import pytest
 from jaxtyping import Array
 
 from rsjax.layers.gpu.feed_forward import feed_forward, fits
+from tests.layers.kernels import INTERPRETED, dtypes
 
 SHAPES = [
     ((1, 1, 128, 32), 128),
@@ -23,7 +24,7 @@ def reference(x: Array, fc1: Any, fc2: Any) -> Array:
 
 
 @pytest.mark.parametrize(("shape", "hidden"), SHAPES)
-@pytest.mark.parametrize(("dtype", "bound"), [(jnp.float32, 3e-6), (jnp.bfloat16, 1e-2)])
+@pytest.mark.parametrize(("dtype", "bound"), dtypes(3e-6))
 def test_values_and_gradients_are_those_of_plain_layers(
     shape: tuple[int, ...], hidden: int, dtype: Any, bound: float
 ) -> None:
@@ -34,7 +35,7 @@ def test_values_and_gradients_are_those_of_plain_layers(
     fc2 = jax.random.normal(keys[2], (hidden, width)) / np.sqrt(hidden), jax.random.normal(keys[3], (width,))
     x = (2 * jax.random.normal(keys[4], shape)).astype(dtype)
     cotangent = jax.random.normal(keys[5], shape).astype(dtype)
-    out, pull = jax.vjp(lambda *operands: feed_forward(*operands, interpret=True), x, fc1, fc2)
+    out, pull = jax.vjp(lambda *operands: feed_forward(*operands, interpret=INTERPRETED), x, fc1, fc2)
     with jax.default_matmul_precision("highest"):
         true_out, true_pull = jax.vjp(reference, x.astype(jnp.float32), fc1, fc2)
         truths = jax.tree.leaves((true_out, true_pull(cotangent.astype(jnp.float32))))

@@ -1,4 +1,4 @@
-"""Tests of the MLP as one kernel a pass on GPUs: values and gradients, by Pallas' interpreter."""
+"""Tests of the MLP as one kernel a pass on GPUs: values and gradients, on the GPU, or else by Pallas' interpreter."""
 
 from typing import Any
 
@@ -10,6 +10,7 @@ import pytest
 from jaxtyping import Array
 
 from rsjax.layers.gpu.mlp import fits, mlp
+from tests.layers.kernels import INTERPRETED, dtypes
 
 SHAPES = [
     ((1, 2, 64, 64), 128),
@@ -38,7 +39,7 @@ def reference(x: Array, norm: Any, fc1: Any, fc2: Any) -> Array:
 
 @pytest.mark.parametrize("has_norm", [True, False])
 @pytest.mark.parametrize(("shape", "hidden"), SHAPES)
-@pytest.mark.parametrize(("dtype", "bound"), [(jnp.float32, 3e-6), (jnp.bfloat16, 1e-2)])
+@pytest.mark.parametrize(("dtype", "bound"), dtypes(3e-6))
 def test_values_and_gradients_are_those_of_plain_layers(
     has_norm: bool, shape: tuple[int, ...], hidden: int, dtype: Any, bound: float
 ) -> None:
@@ -47,7 +48,7 @@ def test_values_and_gradients_are_those_of_plain_layers(
     norm = norm if has_norm else None
     x = (0.5 + 2 * jax.random.normal(jax.random.key(1), shape)).astype(dtype)
     cotangent = jax.random.normal(jax.random.key(2), shape).astype(dtype)
-    out, pull = jax.vjp(lambda *operands: mlp(*operands, interpret=True), x, norm, fc1, fc2)
+    out, pull = jax.vjp(lambda *operands: mlp(*operands, interpret=INTERPRETED), x, norm, fc1, fc2)
     with jax.default_matmul_precision("highest"):
         true_out, true_pull = jax.vjp(reference, x.astype(jnp.float32), norm, fc1, fc2)
         truths = jax.tree.leaves((true_out, true_pull(cotangent.astype(jnp.float32))))
@@ -63,7 +64,7 @@ def test_the_gelu_is_exact() -> None:
     zeros = jnp.zeros(64)
     for gain in (1.0, 3.0):
         kernel = gain * jnp.eye(64)
-        out = mlp(x, None, (kernel, zeros), (jnp.eye(64), zeros), interpret=True) - x
+        out = mlp(x, None, (kernel, zeros), (jnp.eye(64), zeros), interpret=INTERPRETED) - x
         np.testing.assert_allclose(out, nn.gelu(gain * x, approximate=False), atol=2e-6)
 
 

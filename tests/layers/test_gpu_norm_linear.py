@@ -1,4 +1,4 @@
-"""Tests of a norm and the linear layer after it as one kernel on GPUs: values, by Pallas' interpreter."""
+"""Tests of a norm and the linear layer after it as one kernel: values, on a GPU, or else by Pallas' interpreter."""
 
 from functools import partial
 from typing import Any
@@ -11,6 +11,7 @@ import pytest
 
 from rsjax.layers import platform
 from rsjax.layers.gpu.norm_linear import fits, norm_linear
+from tests.layers.kernels import INTERPRETED, dtypes
 
 
 def reference(x: Any, norm: Any, kernel: Any) -> Any:
@@ -19,11 +20,11 @@ def reference(x: Any, norm: Any, kernel: Any) -> Any:
 
 
 @pytest.mark.parametrize(("shape", "outputs"), [((2, 1, 64, 256), 192), ((1, 2, 64, 64), 64)])
-@pytest.mark.parametrize(("dtype", "bound"), [(jnp.float32, 3e-6), (jnp.bfloat16, 1e-2)])
+@pytest.mark.parametrize(("dtype", "bound"), dtypes(3e-6))
 def test_values_are_those_of_plain_layers(shape: tuple[int, ...], outputs: int, dtype: Any, bound: float) -> None:
     assert fits(shape, outputs)
     x, norm, kernel = operands(shape, outputs, dtype)
-    out = norm_linear(x, norm, kernel, interpret=True)
+    out = norm_linear(x, norm, kernel, interpret=INTERPRETED)
     assert out.dtype == dtype
     with jax.default_matmul_precision("highest"):
         truth = reference(x.astype(jnp.float32), norm, kernel)

@@ -8,7 +8,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
+import numpy as np
 from jax.errors import JaxRuntimeError
+from jax.sharding import AbstractMesh, Mesh
 from rich import box
 from rich.console import Console, Group, RenderableType
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
@@ -21,7 +24,7 @@ from rsjax.layers.platform import for_all_platforms
 from rsjax.progress import duration
 from rsjax.tools.compile.programs import Program
 from rsjax.tools.compile.roofline import Roofline, part_of, roofline
-from rsjax.tools.compile.targets import Target
+from rsjax.tools.compile.targets import Target, devices
 
 LAUNCH_SECONDS = 3e-6  # of a kernel on a GPU; 2 to 5 µs
 GPU_SHARE = 0.92  # of a GPU's memory that XLA can use; the rest is the driver's and the libraries'
@@ -63,6 +66,8 @@ def compile_program(program: Program, target: Target, console: Console) -> Compi
     with (
         _shown(f"compiling for {target.title}: {program.title}", console),
         for_all_platforms(),
+        # Kernels are lowered for the kind of device that the mesh names; without it, jax 0.11 looks for a GPU here.
+        jax.sharding.use_abstract_mesh(_without_axes(target)),
         tempfile.TemporaryDirectory() as folder,
     ):
         options: dict[str, Any] = {}
@@ -92,6 +97,12 @@ def compile_program(program: Program, target: Target, console: Console) -> Compi
     kept = memory.argument_size_in_bytes + memory.output_size_in_bytes - memory.alias_size_in_bytes
     temporaries = memory.temp_size_in_bytes
     return Compiled(text, kept + temporaries, temporaries, time.monotonic() - began)
+
+
+def _without_axes(target: Target) -> AbstractMesh:
+    """Returns a mesh that has no axes, and so shards nothing, but names the target's kind of device."""
+    one = Mesh(np.array(devices(target)[:1]), ("device",)).abstract_mesh
+    return AbstractMesh((), (), abstract_device=one.abstract_device)
 
 
 @contextmanager
