@@ -23,7 +23,8 @@ from rsjax.tools.compile.hlo import HOST, Array, Computation, Instruction, Modul
 FREE = {
     "parameter", "constant", "tuple", "get-tuple-element", "bitcast", "after-all", "add-dependency", "domain",
     "partition-id", "replica-id", "opt-barrier", "optimization-barrier", "copy-done", "slice-done", "async-done",
-    "async-update", "all-reduce-done", "all-gather-done", "collective-permute-done", "send-done", "recv-done",
+    "async-update", "fusion-done", "all-reduce-done", "all-gather-done", "collective-permute-done", "send-done",
+    "recv-done",
 }  # fmt: skip
 # Custom calls without a kernel.
 FREE_CALLS = {
@@ -224,6 +225,9 @@ class _Counter:
             return max(branches, key=lambda branch: sum(kernel.total for kernel in branch))
         if one.opcode in ("call", "async-start"):
             return [kernel for name in one.called for kernel in self.kernels(self.module[name], times)]
+        if one.opcode == "fusion-start":  # a fusion beside others; its results lie between its operands and a context
+            given = sum(len(computation[name].arrays) for name in one.operands)
+            one = replace(one, opcode="fusion", arrays=one.arrays[given:-1])
         return [replace(self._kernel(one, computation), launches=times)]
 
     def _trips(self, loop: Instruction) -> int:

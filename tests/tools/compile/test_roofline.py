@@ -87,7 +87,14 @@ def test_a_fusion_reads_its_operands_and_writes_its_results_once() -> None:
     assert cost(entry, fused).bytes == 400 + 400 + 400 + 4
 
 
-def test_a_fusion_reads_the_slice_and_writes_the_update_of_a_stack() -> None:
+STACK = "f32[32,100]{1,0}"
+IN_ORDER = f"ROOT %f = {STACK} fusion(%a, %b, %i), kind=kLoop, calls=%fused"
+BESIDE_OTHERS = f"""%s = (({STACK}, {STACK}, s32[]), {STACK}, u32[]) fusion-start(%a, %b, %i), kind=kLoop, calls=%fused
+    ROOT %f = {STACK} fusion-done(%s)"""
+
+
+@pytest.mark.parametrize("call", [IN_ORDER, BESIDE_OTHERS])
+def test_a_fusion_reads_the_slice_and_writes_the_update_of_a_stack(call: str) -> None:
     fused = """
 %fused (p0: f32[32,100], p1: f32[32,100], p2: s32[]) -> f32[32,100] {
   %p0 = f32[32,100]{1,0} parameter(0)
@@ -100,10 +107,10 @@ def test_a_fusion_reads_the_slice_and_writes_the_update_of_a_stack() -> None:
   ROOT %put = f32[32,100]{1,0} dynamic-update-slice(%p0, %new, %p2, %zero)
 }
 """
-    entry = """%a = f32[32,100]{1,0} parameter(0)
-    %b = f32[32,100]{1,0} parameter(1)
+    entry = f"""%a = {STACK} parameter(0)
+    %b = {STACK} parameter(1)
     %i = s32[] parameter(2)
-    ROOT %f = f32[32,100]{1,0} fusion(%a, %b, %i), kind=kLoop, calls=%fused"""
+    {call}"""
     assert cost(entry, fused).bytes == pytest.approx(400 + 400 + 4)
 
 
