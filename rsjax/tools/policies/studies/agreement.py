@@ -58,10 +58,10 @@ def agreement(true: Float[np.ndarray, " P"], predicted: Float[np.ndarray, " P"],
         raise ValueError(f"agreement needs the same two policies or more in both, not {x.shape} and {y.shape}")
     r = correlation(x, y)
     inside = inner(x)
-    middle = (x >= MIDDLE[0]) & (x <= MIDDLE[1])
+    of_middle = middle(x)
     bias_middle = float("nan")
-    if middle.any():
-        bias_middle = float(np.mean((y - x)[middle]))
+    if of_middle.any():
+        bias_middle = float(np.mean((y - x)[of_middle]))
     return Agreement(
         pearson=fisher(r, len(x), level),
         r2_line=r**2,
@@ -79,6 +79,12 @@ def agreement(true: Float[np.ndarray, " P"], predicted: Float[np.ndarray, " P"],
 def inner(true: Float[np.ndarray, " P"]) -> Bool[np.ndarray, " P"]:
     """Returns which policies sometimes fail and sometimes succeed."""
     return (true > 0) & (true < 1)
+
+
+def middle(true: Float[np.ndarray, " P"]) -> Bool[np.ndarray, " P"]:
+    """Returns which policies have a true rate of 10 to 90 %."""
+    low, high = MIDDLE
+    return (true >= low) & (true <= high)
 
 
 def over_trainings(

@@ -19,10 +19,18 @@ from rsjax.tools.policies.demos import Demos
 from rsjax.tools.policies.judges.validation import markdown, summary
 from rsjax.tools.policies.policy import Policy, load_policy
 from rsjax.tools.policies.policy_training import train_policy
-from rsjax.tools.policies.studies.agreement import agreement, inner, over_trainings
+from rsjax.tools.policies.studies.agreement import agreement, inner, middle, over_trainings
 from rsjax.tools.policies.studies.figures import scatter, side_by_side
 from rsjax.tools.policies.studies.policy_learning import interval_text, percent
-from rsjax.tools.policies.studies.trials import FPS, TrialResult, Trials, first_frames, try_policy
+from rsjax.tools.policies.studies.trials import (
+    FPS,
+    TrialResult,
+    Trials,
+    episode_file,
+    first_frames,
+    replayed,
+    try_policy,
+)
 from rsjax.tools.policies.worlds.world import FIRST_SEED, World
 from rsjax.tools.studies.report.video import write_mp4
 from rsjax.tools.studies.tables import ABSENT, Table, as_markdown, number_text
@@ -57,7 +65,15 @@ TRAININGS = (
     "Over trainings: r is the mean over the runs that differ in their seeds alone. Its interval is for other trainings "
     "of policies, of which it takes two at least, and, with two runs or more, of the world model."
 )
+REPLAYS_HEAD = (
+    "run", "policies", "in the model", "its actions in the simulator", "in the simulator", "by the outcome", "by acting"
+)  # fmt: skip
+REPLAYS = (
+    "The bias is the sum of two: the simulator ends otherwise under the same actions (by the outcome), and the policy "
+    "acts otherwise there (by acting). The actions of each episode in the model are replayed from its start."
+)
 FIRST_TRAINING = "policy"
+REPLAYED = "replayed"  # in the folder of a policy's trials in a world model
 
 
 def checkpoints(
@@ -151,12 +167,15 @@ def compare(
         stage(number, len(models), run, "rolling policies out in this world model")
         world = make()
         made = {}
+        again = {}
         for name, policy in policies.items():
+            folder = out / run / name
             made[name] = try_policy(
-                policy, world, frames, trials, out / run / name, f"{name} in {run}", save_frames=trials.episodes
+                policy, world, frames, trials, folder, f"{name} in {run}", save_frames=trials.episodes
             )
             _videos(out, run, name, trials)
-        row = compared(run, true, made, training or {})
+            again[name] = replayed(simulator, folder, trials, folder / REPLAYED, f"{name} in {run}")
+        row = compared(run, true, made, again, training or {})
         rows.append(row | {"like": (replicates or {}).get(run, run), "judge": summary(world.validation)})
         write_results(out, rows, trials)
     return results_of(rows, trials)
@@ -165,7 +184,7 @@ def compare(
 def _videos(out: Path, run: str, name: str, trials: Trials) -> None:
     """Writes videos of the first episodes: simulator and world model side by side."""
     for number in range(min(trials.videos, trials.episodes)):
-        files = [out / world / name / f"episode-{number:02d}.npz" for world in ("simulator", run)]
+        files = [episode_file(out / world / name, number) for world in ("simulator", run)]
         if all(file.exists() for file in files):
             sides = [np.load(file)["rgb"] for file in files]
             path = out / "videos" / f"{run}-{name}-{number:02d}.mp4"
@@ -173,12 +192,17 @@ def _videos(out: Path, run: str, name: str, trials: Trials) -> None:
 
 
 def compared(
-    run: str, true: Mapping[str, TrialResult], imagined: Mapping[str, TrialResult], training: Mapping[str, str]
+    run: str,
+    true: Mapping[str, TrialResult],
+    imagined: Mapping[str, TrialResult],
+    again: Mapping[str, Sequence[bool]],
+    training: Mapping[str, str],
 ) -> dict[str, Any]:
     """Returns a run's entry in ``results.json``: success in both worlds by policy, and how well they agree.
 
     Args:
         true: by policy; its episodes start as the first ones of ``imagined`` do.
+        again: by policy, whether the actions of the first imagined episodes succeed in the simulator.
         training: the name of each policy's training.
     """
     x, y = (np.array([np.mean(results[name].success) for name in true]) for results in (true, imagined))
@@ -192,6 +216,7 @@ def compared(
             "training": training.get(name, FIRST_TRAINING),
             "simulator": real,
             "world_model": made.success,
+            "replayed": list(again[name]),
             "corrected": asdict(corrected_rate(real, paired, made.success[len(real) :])),
             "uninterpretable": made.uninterpretable,
             "unfamiliarity": made.unfamiliarity,
@@ -301,11 +326,26 @@ def r_text(r: Mapping[str, float | None]) -> tuple[str, str]:
     return f"{r['value']:.3f}", f"{r['low']:.2f} … {r['high']:.2f}"
 
 
+def replay_lines(row: Mapping[str, Any]) -> list[list[str]]:
+    """Returns a run's lines of the table of replays: over all policies, and over those of 10 to 90 %."""
+    worlds = ("world_model", "replayed", "simulator")
+    rates = np.array(
+        [[np.mean(each[world][: len(each["simulator"])]) for world in worlds] for each in row["policies"].values()]
+    )
+    lines = []
+    for title, chosen in (("all", np.ones(len(rates), bool)), ("10 to 90 %", middle(rates[:, 2]))):
+        if chosen.any():
+            model, again, true = rates[chosen].mean(0)
+            biases = [f"{model - again:+.3f}", f"{again - true:+.3f}"]
+            lines.append([row["run"], title, *(f"{100 * rate:.0f} %" for rate in (model, again, true)), *biases])
+    return lines
+
+
 def agreement_tables(results: Mapping[str, Any]) -> str:
     """Returns the results in Markdown: agreement, success, and the judges that decided success."""
     rows = results["runs"]
     agreements = []
-    middle = []
+    middle_rows = []
     for row in rows:
         if "pearson" in row:
             numbers = [row[name] for name in NUMBERS]
@@ -313,7 +353,7 @@ def agreement_tables(results: Mapping[str, Any]) -> str:
             shares = [f"{100 * row[name]:.0f} %" for name in ("same_outcome", "uninterpretable")]
             agreements.append([row["run"], *r_text(row["pearson"]), *others, f"{row['bias']:+.3f}", *shares])
             bias = number_text(row["bias_middle"], "+.3f")
-            middle.append([row["run"], *r_text(row["pearson_inner"]), str(row["inner"]), bias])
+            middle_rows.append([row["run"], *r_text(row["pearson_inner"]), str(row["inner"]), bias])
     over = [
         [", ".join(each["runs"]), str(each["policies"]), *r_text(each["pearson"]), *r_text(each["pearson_inner"])]
         for each in results["trainings"]
@@ -337,7 +377,11 @@ def agreement_tables(results: Mapping[str, Any]) -> str:
         "",
         FORMULAS,
         "",
-        as_markdown(Table(MIDDLE_HEAD, middle)),
+        as_markdown(Table(MIDDLE_HEAD, middle_rows)),
+        "",
+        as_markdown(Table(REPLAYS_HEAD, [line for row in rows for line in replay_lines(row)])),
+        "",
+        REPLAYS,
         "",
         TRAININGS,
         "",

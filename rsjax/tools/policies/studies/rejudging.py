@@ -92,7 +92,8 @@ def rejudge(out: Path, judge: Judge, name: str) -> Path:
         }
         training = {name: each.get("training", FIRST_TRAINING) for name, each in row["policies"].items()}
         judged = {"like": row.get("like", row["run"]), "judge": summary({"raw": checked})}
-        rows.append(compared(row["run"], true, made, training) | judged)
+        again = {name: each["replayed"] for name, each in row["policies"].items()}
+        rows.append(compared(row["run"], true, made, again, training) | judged)
     write_results(folder, rows, Trials(**results["trials"]))
     return folder
 

@@ -1,6 +1,7 @@
 """Tries policies from the same starts, and saves which succeed so that an interrupted series of trials resumes."""
 
 import io
+import itertools
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, closing
 from dataclasses import dataclass, field
@@ -19,10 +20,11 @@ from rsjax.progress import Progress
 from rsjax.tools.policies.policy import Policy
 from rsjax.tools.policies.worlds.model_world import FirstFrame, ModelWorld
 from rsjax.tools.policies.worlds.simulator_world import SimulatorWorld
-from rsjax.tools.policies.worlds.world import FIRST_SEED, World, run_episodes
+from rsjax.tools.policies.worlds.world import FIRST_SEED, Actor, Observation, World, run_episodes
 from rsjax.tools.studies.report.video import write_mp4
 
 FPS = 5.0  # of the videos
+HELD = 2  # steps for which a replay holds its last action: a judge may see a success a step before the simulator
 OTHERS = (
     "holds trials of other episodes or steps, or of another policy, simulator, world model or judge; choose another "
     "--out, or delete it"
@@ -93,14 +95,14 @@ def try_policy(
     Args:
         folder: the folder of the results, which grow as episodes end, and of a few videos.
         name: for the progress line.
-        save_frames: of how many episodes, from the first on, to save the frames as ``episode-NN.npz``, for other
-            judges.
+        save_frames: of how many episodes, from the first on, to save frames and actions as ``episode-NN.npz``, for
+            other judges and :func:`replayed`.
 
     Raises:
         UserError: the result in ``folder`` is from other trials, another policy, or another world or judge.
         FileError: another process runs trials in ``folder``.
     """
-    key = content_key("trials", len(starts), trials.max_steps, trials.together, policy.key, world.key)
+    key = content_key("trials with actions", len(starts), trials.max_steps, trials.together, policy.key, world.key)
     with make_once(folder, key, refuse=OTHERS) as work:
         success = work.metadata.setdefault("success", [])
         uninterpretable = work.metadata.setdefault("uninterpretable", [])
@@ -122,7 +124,7 @@ def try_policy(
                     if number < trials.videos:
                         write_mp4(folder / f"episode-{number:02d}.mp4", episode.rgb, FPS, 4, comment)
                     if number < save_frames:
-                        save_arrays(folder / f"episode-{number:02d}.npz", rgb=episode.rgb)
+                        save_arrays(episode_file(folder, number), rgb=episode.rgb, actions=episode.actions)
                 work.save(
                     success=success, uninterpretable=uninterpretable, clipped=clipped, unfamiliarity=unfamiliarity
                 )
@@ -130,6 +132,56 @@ def try_policy(
     if len(unfamiliarity) < len(success):  # episodes that another command has run
         unfamiliarity = []
     return TrialResult(success, clipped, uninterpretable, unfamiliarity)
+
+
+def episode_file(folder: Path, number: int) -> Path:
+    """Returns the file of an episode's frames and actions in a folder of :func:`try_policy`."""
+    return folder / f"episode-{number:02d}.npz"
+
+
+def replayed(simulator: World, recorded: Path, trials: Trials, folder: Path, name: str) -> list[bool]:
+    """Replays in the simulator what a policy did in a world model from the same starts; keeps the results.
+
+    Args:
+        recorded: the folder of the episodes in the world model.
+        folder: the folder of the results.
+        name: for the progress line.
+
+    Returns:
+        By episode, whether the simulator's task is done by these actions.
+
+    Raises:
+        UserError: the results in ``folder`` are from other episodes or another simulator.
+    """
+    actions = []
+    for number in range(trials.episodes):
+        with np.load(episode_file(recorded, number)) as arrays:
+            actions.append(arrays["actions"][1:])
+    made = content_key("replayed", simulator.key, [rows.tolist() for rows in actions])
+    with make_once(folder, made, refuse=OTHERS) as work:
+        success: list[bool] = work.metadata.setdefault("success", [])
+        with Progress(f"{name}: replays", trials.episodes, "episodes", len(success)) as progress:
+            for first in range(len(success), trials.episodes, simulator.count):
+                group = actions[first : first + simulator.count]
+                steps = min(max(map(len, group)) + HELD, trials.max_steps)
+                seeds = trials.seeds[first : first + simulator.count]
+                episodes = run_episodes(simulator, _repeat(group), seeds, steps)
+                success += [bool(episode.success.any()) for episode in episodes]
+                work.save(success=success)
+                progress.update(len(success), success=sum(success))
+    return success
+
+
+def _repeat(actions: Sequence[np.ndarray]) -> Actor:
+    """Returns an actor that does what the rows of each episode say, holds the last, and then rests."""
+    steps = itertools.count()
+
+    def act(observation: Observation) -> np.ndarray:
+        step = next(steps)
+        rows = [one[min(step, len(one) - 1)] * (step < len(one) + HELD) for one in actions]
+        return np.stack(rows)
+
+    return act
 
 
 def open_lift(config: SimConfig, trials: Trials) -> AbstractContextManager[SimulatorWorld]:

@@ -98,6 +98,25 @@ def test_a_model_that_moves_alike_ranks_alike(tmp_path: Path) -> None:
     assert again["runs"] == []
 
 
+def test_a_replay_tells_what_the_model_mistakes_from_what_the_policy_does_otherwise(tmp_path: Path) -> None:
+    policies: Any = {f"speed-{speed}": ToyPolicy(speed) for speed in (0.1, 0.8, 1.0)}
+    models: Any = {"true": lambda: imagined(5), "fast": lambda: imagined(5, pace=3.0)}
+    results = compare(policies, simulated(5), models, TRIALS, tmp_path)
+    same, fast = (row["policies"].values() for row in results["runs"])
+    assert all(each["replayed"] == each["simulator"] == each["world_model"] for each in same)
+    # In the fast world the dot arrives by actions that do not take it there in the simulator.
+    rates = np.array([[np.mean(each[of]) for of in ("world_model", "replayed", "simulator")] for each in fast])
+    assert (rates[1:, 0] > rates[1:, 1]).all()
+    model, replays, true = rates.mean(0)
+    shares = " | ".join(f"{100 * rate:.0f} %" for rate in (model, replays, true))
+    line = f"| fast | all | {shares} | {model - replays:+.3f} | {replays - true:+.3f} |"
+    assert line in squeezed(tmp_path / "results.md")
+    again = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("replayed/made.json")}
+    assert len(again) == 6
+    compare(policies, simulated(5), models, TRIALS, tmp_path)
+    assert again == {path: path.stat().st_mtime_ns for path in again}
+
+
 def test_more_imagined_trials_than_true_ones_correct_the_rate_by_the_pairs(tmp_path: Path) -> None:
     policies: Any = {f"speed-{speed}": ToyPolicy(speed) for speed in (0.1, 0.8, 0.9, 1.0)}
     models: Any = {"true": lambda: imagined(5), "slow": lambda: imagined(5, pace=0.9)}
