@@ -82,15 +82,26 @@ def cases() -> list[Case]:
     found = [_mlp(8, 256), _mlp(8, 128), _feed_forward(8, 512), _feed_forward(4, 1024)]
     found += [_attention(8, 8, 32, "cells"), _attention(8, 8, 32, "frames")]
     found += [_attention(4, 16, 64, "cells"), _attention(4, 16, 64, "frames")]
-    return [*found, _norm_linear(8), _cached(8)]
+
+    def plain_norm(x: Any, norm: Any, kernel: Any) -> Any:
+        return dense(normalised(x, norm), kernel, None, True)
+
+    def over_cache(qkv: Any, k: Any, v: Any) -> Any:
+        return cached_attention.attend(qkv, k, v, 14, 16)
+
+    def plain_over_cache(qkv: Any, k: Any, v: Any) -> Any:
+        return attend_cached(qkv, KeyValues(k, v), 14, 16)
+
+    one = _features(8, 1, 256), (jnp.ones(256), jnp.zeros(256)), _normal(1, 256, 768, scale=1 / 16)
+    found.append(Case("norm and qkv of a frame, 8 clips", one, norm_linear.norm_linear, plain_norm, False))
+    cache = (_normal(number, 8, 256, 8, 16, 32, dtype=jnp.bfloat16) for number in (1, 2))
+    frame = _normal(0, 8, 1, 256, 3, 8, 32, dtype=jnp.bfloat16), *cache
+    found.append(Case("attention over the cache, 8 clips", frame, over_cache, plain_over_cache, False))
+    return found
 
 
 def _normal(number: int, *shape: int, dtype: Any = jnp.float32, scale: float = 1.0) -> jax.Array:
     return (scale * jax.random.normal(jax.random.key(number), shape)).astype(dtype)
-
-
-def _layers(x: Any, norm: Any, fc1: Any, fc2: Any) -> Any:
-    return x + dense(gelu(dense(normalised(x, norm), fc1[0], fc1[1], True)), fc2[0], fc2[1], True)
 
 
 def _two_linear(width: int) -> tuple[Any, Any]:
@@ -104,9 +115,12 @@ def _features(clips: int, frames: int, width: int) -> jax.Array:
 
 
 def _mlp(clips: int, width: int) -> Case:
+    def plain(x: Any, norm: Any, fc1: Any, fc2: Any) -> Any:
+        return x + dense(gelu(dense(normalised(x, norm), fc1[0], fc1[1], True)), fc2[0], fc2[1], True)
+
     norm = jnp.ones(width), jnp.zeros(width)
     operands = _features(clips, 16, width), norm, *_two_linear(width)
-    return Case(f"MLP of width {width}, {clips} clips", operands, mlp.mlp, _layers)
+    return Case(f"MLP of width {width}, {clips} clips", operands, mlp.mlp, plain)
 
 
 def _feed_forward(clips: int, width: int) -> Case:
@@ -128,27 +142,6 @@ def _attention(clips: int, heads: int, width: int, over: Any) -> Case:
     qkv = _normal(0, clips, 16, 256, 3, heads, width, dtype=jnp.bfloat16)
     name = f"attention over {over}, {heads} heads of {width}, {clips} clips"
     return Case(name, (qkv,), partial(attention.attend, over=over), plain)
-
-
-def _norm_linear(clips: int) -> Case:
-    def plain(x: Any, norm: Any, kernel: Any) -> Any:
-        return dense(normalised(x, norm), kernel, None, True)
-
-    operands = _features(clips, 1, 256), (jnp.ones(256), jnp.zeros(256)), _normal(1, 256, 768, scale=1 / 16)
-    return Case(f"norm and qkv of a frame, {clips} clips", operands, norm_linear.norm_linear, plain, False)
-
-
-def _cached(clips: int) -> Case:
-    def ours(qkv: Any, k: Any, v: Any) -> Any:
-        return cached_attention.attend(qkv, k, v, 14, 16)
-
-    def plain(qkv: Any, k: Any, v: Any) -> Any:
-        return attend_cached(qkv, KeyValues(k, v), 14, 16)
-
-    cache = (clips, 256, 8, 16, 32)
-    qkv = _normal(0, clips, 1, 256, 3, 8, 32, dtype=jnp.bfloat16)
-    operands = qkv, _normal(1, *cache, dtype=jnp.bfloat16), _normal(2, *cache, dtype=jnp.bfloat16)
-    return Case(f"attention over the cache, {clips} clips", operands, ours, plain, False)
 
 
 if __name__ == "__main__":

@@ -63,11 +63,14 @@ def compile_program(program: Program, target: Target, console: Console) -> Compi
         UserError: the compiler refuses it; the message is its first line and names a file with the rest.
     """
     began = time.monotonic()
+    one = Mesh(np.array(devices(target)[:1]), ("device",)).abstract_mesh
+    kind = AbstractMesh((), (), abstract_device=one.abstract_device)
     with (
         _shown(f"compiling for {target.title}: {program.title}", console),
         for_all_platforms(),
-        # Kernels are lowered for the kind of device that the mesh names; without it, jax 0.11 looks for a GPU here.
-        jax.sharding.use_abstract_mesh(_without_axes(target)),
+        # Kernels are lowered for the kind of device that a mesh names, if only one without axes, which shards nothing.
+        # Without it, jax 0.11 looks for a GPU here.
+        jax.sharding.use_abstract_mesh(kind),
         tempfile.TemporaryDirectory() as folder,
     ):
         options: dict[str, Any] = {}
@@ -97,12 +100,6 @@ def compile_program(program: Program, target: Target, console: Console) -> Compi
     kept = memory.argument_size_in_bytes + memory.output_size_in_bytes - memory.alias_size_in_bytes
     temporaries = memory.temp_size_in_bytes
     return Compiled(text, kept + temporaries, temporaries, time.monotonic() - began)
-
-
-def _without_axes(target: Target) -> AbstractMesh:
-    """Returns a mesh that has no axes, and so shards nothing, but names the target's kind of device."""
-    one = Mesh(np.array(devices(target)[:1]), ("device",)).abstract_mesh
-    return AbstractMesh((), (), abstract_device=one.abstract_device)
 
 
 @contextmanager

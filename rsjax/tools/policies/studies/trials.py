@@ -165,14 +165,14 @@ def replayed(simulator: World, recorded: Path, trials: Trials, folder: Path, nam
                 group = actions[first : first + simulator.count]
                 steps = min(max(map(len, group)) + HELD, trials.max_steps)
                 seeds = trials.seeds[first : first + simulator.count]
-                episodes = run_episodes(simulator, _repeat(group), seeds, steps)
+                episodes = run_episodes(simulator, repeat_actions(group), seeds, steps)
                 success += [bool(episode.success.any()) for episode in episodes]
                 work.save(success=success)
                 progress.update(len(success), success=sum(success))
     return success
 
 
-def _repeat(actions: Sequence[np.ndarray]) -> Actor:
+def repeat_actions(actions: Sequence[np.ndarray]) -> Actor:
     """Returns an actor that does what the rows of each episode say, holds the last, and then rests."""
     steps = itertools.count()
 
