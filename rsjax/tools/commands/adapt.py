@@ -29,7 +29,7 @@ class Options(Adaptation):
     data_dir: Path = Path("data")
     """Directory of simulated data sets."""
     judge: Path | None = None
-    """Folder of the judge of success; default: the run's own (rsjax judge)."""
+    """Folder of the judge of success, or head: each model's own success head; default: the run's (rsjax judge)."""
     trials: int = 50
     """Episodes of each policy in which success is measured."""
     max_steps: int = 30
@@ -72,7 +72,7 @@ def main() -> None:
         simulator = None
         if policies:
             config = data.simulator
-            data.judge(options.judge)  # checked before minutes of work
+            data.world_judge(options.judge)  # checked before minutes of work
             simulator = stack.enter_context(open_lift(config, trials))
         behaviour = Behaviour(policies, simulator, trials, options.judge, options.episodes)
         adapt(data, behaviour, part(options, Adaptation), out, shlex.join([*PROG.split(), *sys.argv[1:]]))

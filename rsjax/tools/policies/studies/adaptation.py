@@ -92,7 +92,8 @@ class Behaviour:
         policies: by name; measured in the simulator and in the models. Without ``episodes`` the model learns from them.
         simulator: in which they act; None without policies.
         trials: the episodes in which success is measured, and their steps, which are also those of rollouts.
-        judge: folder of the judge that decides on success in the models; None: the run's own.
+        judge: folder of the judge that decides on success in the models, or "head" for each model's own success head;
+            None: the run's judge.
         episodes: a store of recorded episodes to learn from, with held-out ones in its test split.
     """
 
