@@ -1,8 +1,8 @@
 """Paired grasps: the same start and approach, then fingers that close at several distances from the cube.
 
 The position of the fingers alone decides whether a grasp succeeds, since the episodes of a group share everything else:
-start, height, speed, noise, and what follows the closing. Groups differ in height, because a model that has seen most
-grasps at one height takes those a centimetre above it for misses.
+start, height, times, speed, noise, and what follows the closing. Groups differ in height and in times, because a model
+that has seen most grasps at one height, or all without a pause, takes others for misses.
 """
 
 from dataclasses import dataclass
@@ -18,6 +18,8 @@ ABOVE = ((0.0, 0.018), (0.019, 0.027), (0.027, 0.036), (0.036, 0.06))
 GROUP = len(BESIDE)
 HEIGHT = (-0.012, 0.024)  # to the cube's edge, above the cube's centre, where the fingers of a group close beside it
 ABOVE_SHARE = 0.25  # of the groups; the others close beside the cube
+PAUSE = 14  # control steps over the point of closing, at most
+STOP_SHARE = 0.5  # of the groups: the fingers close where they have come to, not yet at the point
 
 
 @dataclass(frozen=True)
@@ -27,6 +29,8 @@ class GraspManner:
     Attributes:
         hover: height above the cube's centre at which the episodes of a group part.
         offset: from the cube's centre at that moment to the point where the fingers close.
+        pause: over the point where the fingers close, before the descent.
+        stops: whether the descent stops as the fingers begin to close.
         speed, noise, delay, squeeze: as in :class:`rsjax.tools.sim.expert.Manner`.
         carry: displacement after the fingers have closed.
     """
@@ -34,6 +38,8 @@ class GraspManner:
     mode: str
     hover: float
     offset: tuple[float, float, float]
+    pause: int
+    stops: bool
     speed: float
     noise: float
     delay: int
@@ -45,11 +51,14 @@ class GraspManner:
         return Scripted(self, self.moves, (self.noise, 0.02), rng)
 
     def moves(self, see: See) -> Moves:
-        """Approaches, parts from the group, closes and lifts."""
+        """Approaches, parts from the group, pauses, closes and lifts."""
         yield from stay(OPEN, self.delay)
         yield from hover(see, np.array([0, 0, self.hover]), self.speed, steps=24)
         point = see().cube + np.array(self.offset)
+        yield from go(see, point + np.array([0, 0, self.hover]), OPEN, self.speed, steps=self.pause)
         yield from go(see, point, OPEN, self.speed, steps=14, near=0.007)
+        if self.stops:
+            point = see().gripper.copy()
         yield from go(see, point, CLOSE, self.speed, self.squeeze)
         yield from go(see, point + np.array(self.carry), CLOSE, self.speed, steps=60)
 
@@ -71,6 +80,8 @@ def grasps(rng: np.random.Generator, number: int) -> GraspManner:
         mode="grasps",
         hover=float(rng.uniform(0.06, 0.1)),
         offset=(float(x), float(y), float(z + height)),
+        pause=int(rng.integers(0, PAUSE + 1)),
+        stops=bool(rng.random() < STOP_SHARE),
         speed=float(rng.uniform(0.75, 1.0)),
         noise=float(rng.uniform(0.0, 0.1)),
         delay=int(rng.integers(0, 4)),
