@@ -11,8 +11,8 @@ import pytest
 from rsjax.layers.attention import KeyValues, attend_cached
 from rsjax.layers.gpu.cached_attention import attend, fits
 from rsjax.layers.kernel_flops import kernel_flops
-from rsjax.layers.platform import attend_over_cache, for_all_platforms
-from tests.layers.kernels import INTERPRETED, dtypes
+from rsjax.layers.platform import attend_over_cache
+from tests.layers.kernels import INTERPRETED, dtypes, lowered
 
 SHAPE = (2, 2, 8, 3, 2, 32)
 SLOTS = 16
@@ -79,9 +79,8 @@ def test_other_shapes_do_not_fit(shape: tuple[int, ...], slots: int) -> None:
 def test_programs_for_gpus_alone_have_the_kernel_and_for_a_bf16_cache_alone(dtype: Any, has_kernel: set[str]) -> None:
     qkv, keys, values = operands(SHAPE, SLOTS, jnp.bfloat16)
     cache = KeyValues(keys.astype(dtype), values.astype(dtype))
-    with for_all_platforms():
-        traced = jax.jit(partial(attend_over_cache, window=16)).trace(qkv, cache, 3)
-    texts = {name: traced.lower(lowering_platforms=(name,)).as_text() for name in ("cpu", "cuda", "tpu")}
+    run = partial(attend_over_cache, window=16)
+    texts = {name: lowered(run, (qkv, cache, 3), name) for name in ("cpu", "cuda", "tpu")}
     assert {name for name, text in texts.items() if "attend_cache" in text} == has_kernel
 
 

@@ -11,6 +11,7 @@ import pytest
 from rsjax.layers import accelerator, platform
 from rsjax.layers.cpu.matmul import matmul_bf16
 from rsjax.layers.dense import Dense, rounded
+from tests.layers.kernels import lowered
 
 CONVOLUTION = {"window_strides": (1, 1), "padding": "SAME", "dimension_numbers": ("NHWC", "HWIO", "NHWC")}
 
@@ -28,11 +29,6 @@ DOORS: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {
         (numbers(1, 4, 6, 6, 32), numbers(3, 3, 3, 32, 32)),
     ),
 }
-
-
-def lowered(run: Callable[..., Any], operands: tuple[Any, ...], target: str) -> str:
-    with platform.for_all_platforms():
-        return jax.jit(run).trace(*operands).lower(lowering_platforms=(target,)).as_text()
 
 
 @pytest.mark.usefixtures("bf16_units")

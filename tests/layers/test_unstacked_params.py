@@ -7,10 +7,10 @@ import jax
 import numpy as np
 
 from rsjax.config import SampleConfig
-from rsjax.layers.platform import for_all_platforms
 from rsjax.layers.unstacked_params import stack_params, unstack_params
 from rsjax.models.ivideogpt.rollout import sample
 from rsjax.models.roboscape.sample import encode_prompt, rollout, rollout_from
+from tests.layers.kernels import lowered
 from tests.models.ivideogpt import toy
 from tests.models.roboscape.toy_sample import BATCH, DUAL, KEY, given, random_params
 
@@ -54,7 +54,5 @@ def test_ivideogpt_draws_the_same_tokens() -> None:
 def test_a_rollout_on_a_gpu_has_no_loop_over_blocks() -> None:
     params, (tokens, actions) = random_params(DUAL), given(DUAL, 2)
     arch = replace(DUAL, compute_dtype="bfloat16")
-    with for_all_platforms():
-        program = jax.jit(partial(rollout, arch, SampleConfig(steps=2))).trace(params, tokens, actions, KEY)
-    text = program.lower(lowering_platforms=("cuda",)).as_text()
+    text = lowered(partial(rollout, arch, SampleConfig(steps=2)), (params, tokens, actions, KEY), "cuda")
     assert text.count("stablehlo.while") == 3  # over the prompt's blocks, over frames, and over later passes

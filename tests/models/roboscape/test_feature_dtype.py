@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rsjax.layers.platform import for_all_platforms
 from rsjax.models.roboscape.transformer import Transformer, run_transformer
+from tests.layers.kernels import lowered
 from tests.models.roboscape.toy import DUAL, random_inputs, random_params
 
 WIDE = replace(DUAL, width=32, compute_dtype="bfloat16")
@@ -42,9 +42,9 @@ def test_a_program_for_a_cpu_keeps_features_in_float32() -> None:
 
 
 def test_a_program_for_a_gpu_has_features_in_bf16() -> None:
-    with for_all_platforms():
-        run = jax.jit(partial(run_transformer, WIDE)).trace(random_params(WIDE), *random_inputs(WIDE))
+    run = partial(run_transformer, WIDE)
+    operands = random_params(WIDE), *random_inputs(WIDE)
     clips, frames = random_inputs(WIDE)[1].shape[:2]
     features = f"tensor<{clips}x{frames}x{WIDE.grid**2}x{WIDE.width}xbf16>"
-    assert features in run.lower(lowering_platforms=("cuda",)).as_text()
-    assert features not in run.lower(lowering_platforms=("cpu",)).as_text()
+    assert features in lowered(run, operands, "cuda")
+    assert features not in lowered(run, operands, "cpu")
