@@ -16,6 +16,15 @@ from rsjax.runtime import HUGE_PAGES
 ROOT = Path(__file__).parents[3]
 
 
+def printed_by(module: str, *arguments: object) -> str:
+    """Runs a command in this process, and returns what it prints."""
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(io.StringIO()) as printed:
+        patch.setenv("GLIBC_TUNABLES", HUGE_PAGES)  # else the process would start over
+        patch.setattr(sys, "argv", [module, *map(str, arguments)])
+        importlib.import_module(module if module.startswith("experiments") else f"{module}.__main__").main()
+    return printed.getvalue()
+
+
 @dataclass(frozen=True)
 class Commands:
     """Runs the project's commands as a user does, each in a process of its own.
@@ -34,13 +43,13 @@ class Commands:
     def train(self, run: Path, *arguments: object) -> subprocess.CompletedProcess[str]:
         return self("experiments.train", "debug", "--run-dir", run, *arguments)
 
+    def train_here(self, run: Path, *arguments: object) -> str:
+        """Trains in this process, as :meth:`here` runs any command."""
+        return self.here("experiments.train", "debug", "--run-dir", run, *arguments)
+
     def here(self, module: str, *arguments: object) -> str:
         """Runs a command in this process, since starting one takes seconds, and returns what it prints."""
-        with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(io.StringIO()) as printed:
-            patch.setenv("GLIBC_TUNABLES", HUGE_PAGES)  # else the process would start over
-            patch.setattr(sys, "argv", [module, *map(str, arguments), "--data-dir", str(self.data)])
-            importlib.import_module(module if module.startswith("experiments") else f"{module}.__main__").main()
-        return printed.getvalue()
+        return printed_by(module, *arguments, "--data-dir", self.data)
 
     def refused(self, module: str, *arguments: object) -> str:
         """Returns the one line on standard error of a command that cannot be carried out, run in this process."""

@@ -2,8 +2,6 @@
 
 import dataclasses
 import json
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +25,7 @@ from rsjax.tools.pipeline.stages import prepare
 from rsjax.tools.pipeline.validation import record_batches
 from tests.bridge import BRIDGE, needs_bridge
 from tests.tools.pipeline import toy
-from tests.tools.pipeline.conftest import ROOT
+from tests.tools.pipeline.conftest import printed_by
 from tests.tools.pipeline.damage import damage
 
 
@@ -193,21 +191,14 @@ def tokenized(clips: Store, place: Path) -> Store:
     return tokenize_store(clips, toy.codec(clips), toy.config().clips.image_size, place, 0.01)
 
 
-def commanded(folder: Path, module: str, *arguments: object) -> str:
-    line = [sys.executable, "-m", f"experiments.{module}", *map(str, arguments)]
-    done = subprocess.run(line, cwd=ROOT, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
-
-
 @needs_bridge
 def test_real_episodes_from_recording_to_video(tmp_path: Path) -> None:
     """The README's commands, shortened: ingest, train ``debug`` instead of ``tiny``, generate."""
     store, run = tmp_path / "bridge", tmp_path / "run"
-    commanded(tmp_path, "ingest", "rlds", BRIDGE, "--out", store, "--windows.rate", 0, "--windows.frames", 8)
+    printed_by("experiments.ingest", "rlds", BRIDGE, "--out", store, "--windows.rate", 0, "--windows.frames", 8)
     few = ["--tokenizer-train.steps", 2, "--train.steps", 2, "--model.sample.steps", 2]
     few += ["--eval.clips", 2, "--eval.batch-size", 2, "--eval.action-draws", 1]
-    told = commanded(tmp_path, "train", "debug", "--store", store, "--run-dir", run, *few)
+    told = printed_by("experiments.train", "debug", "--store", store, "--run-dir", run, *few)
     assert "no clip has depth, so depth trains with its loss masked" in told
     log = [json.loads(line) for line in (run / "world_model" / "log.jsonl").read_text().splitlines()]
     trained = [row for row in log if "loss" in row]
@@ -222,7 +213,8 @@ def test_real_episodes_from_recording_to_video(tmp_path: Path) -> None:
     assert len(open_store(tokens).source("train")) == len(open_store(store).source("train"))
 
     store.rename(tmp_path / "moved")
-    told = commanded(tmp_path, "generate", run, "--store", tmp_path / "moved", "--clips", 1, "--out", tmp_path / "out")
+    moved = ("--store", tmp_path / "moved")
+    told = printed_by("experiments.generate", run, *moved, "--clips", 1, "--out", tmp_path / "out")
     (video,) = (tmp_path / "out").glob("*.mp4")
     assert str(video) in told
     assert cv2.VideoCapture(str(video)).get(cv2.CAP_PROP_FRAME_COUNT) == 8

@@ -41,13 +41,6 @@ class Place:
     out: Path
 
 
-def done(command: Commands, *words: object) -> str:
-    """Returns what the command prints, run in a process of its own."""
-    ended = command("experiments.adapt", *words)
-    assert ended.returncode == 0, ended.stderr
-    return ended.stdout
-
-
 @pytest.fixture(scope="module")
 def place(debug: Path, command: Commands, tmp_path_factory: pytest.TempPathFactory) -> Place:
     folder = tmp_path_factory.mktemp("adapt")
@@ -57,7 +50,7 @@ def place(debug: Path, command: Commands, tmp_path_factory: pytest.TempPathFacto
     config = toy()
     demos = RunData(run, command.data).demos("all")
     train_policy(replace(config, train=replace(config.train, steps=1)), demos, folder / "policy")
-    done(command, run, "--policy", folder / "policy", *QUICK, "--out", folder / "out")
+    command.here("experiments.adapt", run, "--policy", folder / "policy", *QUICK, "--out", folder / "out")
     return Place(run, folder / "policy", folder / "out")
 
 
@@ -134,7 +127,7 @@ def test_a_call_on_the_episodes_that_is_killed_and_runs_again_gives_the_same_byt
     words = (place.run, "--episodes", store, "--steps", 4, "--out", tmp_path)
     killed = command("tests.tools.policies.killed", *words)
     assert killed.returncode == -signal.SIGKILL, killed.stderr
-    done(command, *words)
+    command.here("experiments.adapt", *words)
     for file in ("on-policy-1/clips/train-00000.array_record", "on-policy-1/clips/test-00000.array_record"):
         assert (tmp_path / file).read_bytes() == (place.out / file).read_bytes()
     params = [load(each / "round-1").params for each in (tmp_path, place.out)]
