@@ -24,12 +24,18 @@ def cells(name: str, kind: str = "code") -> list[dict[str, Any]]:
     return [cell for cell in notebook["cells"] if cell["cell_type"] == kind]
 
 
-def run(name: str) -> dict[str, Any]:
-    """Runs a notebook's cells and returns their variables; a line ``!rsjax …`` calls the command in this process."""
+def run(name: str, steps: int = 0) -> dict[str, Any]:
+    """Runs a notebook's cells and returns their variables; a line ``!rsjax …`` calls the command in this process.
+
+    Args:
+        steps: of every training, in place of the notebook's own number; 0: as many as there.
+    """
     variables: dict[str, Any] = {}
 
     def command(line: str) -> None:
         _, *words = shlex.split(line.format(**variables))
+        if steps and "--steps" in words:
+            words[words.index("--steps") + 1] = str(steps)
         with patch.object(sys, "argv", ["rsjax", *words]):
             main()
 
@@ -59,7 +65,7 @@ def test_generate_and_look() -> None:
 
 
 def test_bring_your_own_data(tmp_path: Path) -> None:
-    made = run("2_bring_your_own_data.ipynb")
+    made = run("2_bring_your_own_data.ipynb", steps=4)
     assert made["store"].counts() == {"train": 12, "test": 4}
     assert (tmp_path / "runs" / "mine" / "report.html").exists()
     scores = {name: made["psnr"](made["truth"], frames)[:, 1:].mean() for name, frames in made["predictions"].items()}
