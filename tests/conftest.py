@@ -1,5 +1,6 @@
 """Settings that must be made before jax is loaded, here and in the processes that tests start; shared fixtures."""
 
+import gc
 import importlib.util
 import os
 import shutil
@@ -58,6 +59,16 @@ settings.load_profile("any-speed")
 
 # Directories whose tests take longest. They run first, so that no worker still has one of them left at the end.
 LONGEST = ("models", "reliability", "tools/pipeline", "tools/studies", "training", "tools/policies")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def earlier_objects() -> None:
+    """Spares the collector the millions of objects that the tests of earlier files have left, such as programs.
+
+    robosuite collects whenever it closes a simulator, and with those objects this takes seconds each time.
+    """
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture
