@@ -17,7 +17,7 @@ from rsjax.tools.sim.episode import EpisodePlan, clip_seed, run_episode
 from rsjax.tools.sim.expert import OPEN, LiftState
 from rsjax.tools.sim.lift import LiftSim
 from rsjax.tools.sim.panda import REACH, STEP
-from rsjax.tools.sim.recipes.grasps import GROUP
+from rsjax.tools.sim.recipes.grasps import GROUP, HEIGHT, PAUSE, SHORT
 from rsjax.tools.sim.recipes.plans import RECIPES, held_out_plans, scripted, training_plans
 
 CONFIG = SimConfig(episodes=24, test_episodes=4, frames=3, tracks=20, seed=5)
@@ -156,6 +156,10 @@ def test_groups_of_grasps_beside_the_cube_differ_in_height_and_their_episodes_do
     plans = [scripted(CONFIG, "grasps", place, f"{place}") for place in range(100 * GROUP)]
     offsets = np.array([plan.manner.offset for plan in plans]).reshape(100, GROUP, 3)  # type: ignore[union-attr]
     beside = np.abs(offsets[..., :2]).max((1, 2)) > 0
-    heights = offsets[beside, :, 2]
-    np.testing.assert_array_equal(heights, heights[:, :1].repeat(GROUP, 1))
-    assert -0.012 <= heights.min() < -0.009 and 0.015 < heights.max() <= 0.018
+    stops = np.array([plan.manner.stops for plan in plans]).reshape(100, GROUP)  # type: ignore[union-attr]
+    heights = (offsets[..., 2] + SHORT * stops)[beside]
+    np.testing.assert_allclose(heights, heights[:, :1].repeat(GROUP, 1), rtol=1e-12)
+    low, high = HEIGHT
+    assert low <= heights.min() < low + 0.003 and high - 0.003 < heights.max() <= high
+    pauses = np.array([plan.manner.pause for plan in plans])  # type: ignore[union-attr]
+    assert (pauses.min(), pauses.max()) == (0, PAUSE) and 0.3 < stops.mean() < 0.7

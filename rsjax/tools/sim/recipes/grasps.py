@@ -20,6 +20,7 @@ HEIGHT = (-0.012, 0.024)  # to the cube's edge, above the cube's centre, where t
 ABOVE_SHARE = 0.25  # of the groups; the others close beside the cube
 PAUSE = 14  # control steps over the point of closing, at most
 STOP_SHARE = 0.5  # of the groups: the fingers close where they have come to, not yet at the point
+SHORT = 0.01  # as far above the point, metres; so the point lies lower by this
 
 
 @dataclass(frozen=True)
@@ -67,6 +68,7 @@ def grasps(rng: np.random.Generator, number: int) -> GraspManner:
     """Draws a group of grasps, and returns one of it: its ``offset`` alone depends on the episode's number."""
     angle = rng.uniform(0, 2 * np.pi)
     height = rng.uniform(*HEIGHT)
+    stops = bool(rng.random() < STOP_SHARE)
     if rng.random() < ABOVE_SHARE:
         intervals = np.array(ABOVE)
         direction = np.array([0, 0, 1])
@@ -74,6 +76,7 @@ def grasps(rng: np.random.Generator, number: int) -> GraspManner:
     else:
         intervals = np.array(BESIDE)
         direction = np.array([np.cos(angle), np.sin(angle), 0])
+    height -= SHORT * stops
     distances = rng.uniform(intervals[:, 0], intervals[:, 1])
     x, y, z = distances[number % GROUP] * direction
     return GraspManner(
@@ -81,7 +84,7 @@ def grasps(rng: np.random.Generator, number: int) -> GraspManner:
         hover=float(rng.uniform(0.06, 0.1)),
         offset=(float(x), float(y), float(z + height)),
         pause=int(rng.integers(0, PAUSE + 1)),
-        stops=bool(rng.random() < STOP_SHARE),
+        stops=stops,
         speed=float(rng.uniform(0.75, 1.0)),
         noise=float(rng.uniform(0.0, 0.1)),
         delay=int(rng.integers(0, 4)),

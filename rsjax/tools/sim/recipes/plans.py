@@ -36,7 +36,7 @@ class Recipe:
 
 
 RECIPES = {
-    "grasps": Recipe(grasps.grasps, 10_000_000, grasps.GROUP, version=4),
+    "grasps": Recipe(grasps.grasps, 10_000_000, grasps.GROUP, version=5),
     "pushes": Recipe(pushes.pushes, 20_000_000),
     "slips": Recipe(slips.slips, 30_000_000),
     "driving": Recipe(driving.driving, 40_000_000),
