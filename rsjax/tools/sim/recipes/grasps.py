@@ -16,7 +16,7 @@ from rsjax.tools.sim.recipes.script import Moves, Scripted, See, go, hover, stay
 BESIDE = ((0.0, 0.018), (0.02, 0.03), (0.03, 0.04), (0.04, 0.055))
 ABOVE = ((0.0, 0.018), (0.019, 0.027), (0.027, 0.036), (0.036, 0.06))
 GROUP = len(BESIDE)
-HEIGHT = (-0.012, 0.024)  # to the cube's edge, above the cube's centre, where the fingers of a group close beside it
+HEIGHT = (-0.012, 0.024)  # above the cube's centre, up to its edge: where the fingers of a group close beside it
 ABOVE_SHARE = 0.25  # of the groups; the others close beside the cube
 PAUSE = 14  # control steps over the point of closing, at most
 STOP_SHARE = 0.5  # of the groups: the fingers close where they have come to, not yet at the point
