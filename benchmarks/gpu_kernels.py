@@ -3,8 +3,6 @@
 ``python -m benchmarks.gpu_kernels`` prints a line for each kernel, forward alone and with its gradient.
 """
 
-import statistics
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -18,9 +16,10 @@ from rsjax.layers.attention import attend as plain_attend
 from rsjax.layers.dense import dense, normalised
 from rsjax.layers.gelu import gelu
 from rsjax.layers.gpu import attention, cached_attention, feed_forward, mlp, norm_linear
+from rsjax.tools.bench.timing import median_seconds
 
 CALLS = 10  # in a measurement, to hide the launches
-MEASUREMENTS = 7
+BUDGET = 1.0  # seconds of a measurement
 
 
 @dataclass(frozen=True)
@@ -57,14 +56,8 @@ def main() -> None:
 
 def milliseconds(run: Callable[..., Any], operands: tuple[Any, ...]) -> float:
     """Returns the median time of a call."""
-    compiled = jax.jit(run).lower(*operands).compile()
-    jax.block_until_ready(compiled(*operands))
-    found = []
-    for _ in range(MEASUREMENTS):
-        began = time.perf_counter()
-        jax.block_until_ready([compiled(*operands) for _ in range(CALLS)])
-        found.append((time.perf_counter() - began) / CALLS)
-    return 1e3 * statistics.median(found)
+    compiled = jax.jit(run)
+    return 1e3 * median_seconds(lambda: [compiled(*operands) for _ in range(CALLS)], BUDGET) / CALLS
 
 
 def with_gradient(run: Callable[..., Any]) -> Callable[..., Any]:

@@ -31,7 +31,8 @@ def test_a_training_takes_the_same_course(preset: str, blocks: int) -> None:
     config = with_values(presets.get(preset), {"model.blocks": blocks})
     loop = dataclasses.replace(config.loop("world_model"), batch_size=CLIPS, sharding="jit")
     model = create_model(config)
-    gpu, cpu = jax.devices("gpu")[0], jax.devices("cpu")[0]
+    gpu = jax.devices("gpu")[0]
+    cpu = jax.devices("cpu")[0]
     with jax.default_device(cpu):
         start = jax.device_get((create_state(model, loop), inputs.batch(model, config, CLIPS)))
 

@@ -144,6 +144,7 @@ def test_what_cannot_be_adapted_is_refused(place: Place, command: Commands) -> N
         ((), "name policies with --policy DIR, recorded episodes with --episodes STORE, or both"),
         ((*episodes, "--share", 1), "--share is 1.0"),
         ((*episodes, "--rounds", 3), "--rounds is 3; it is 1 or 2"),
+        (("--policy", place.policy, *QUICK, "--judge", "head"), "no state heads"),
         (other, "holds an adaptation of another run, to other policies or episodes, or with other settings"),
     ):
         assert wrong in command.refused("experiments.adapt", place.run, *bad)
