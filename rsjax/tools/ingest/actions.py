@@ -310,15 +310,13 @@ def _no_steps(
             why = "is a gripper"
         elif len(values) >= _FEWEST and values.min() * values.max() > 0 and reach.min() > _NEAR * reach.max():
             why = f"never comes near zero ({values.min():.3g} to {values.max():.3g})"
-        elif states is not None and _follows(values, states[:, place]):
-            why = "is nearly the state"
+        elif states is not None:
+            # Real steps would be as far from the state as zero is.
+            state = states[:, place]
+            if np.sqrt(np.mean(np.square(values - state))) < _FOLLOWS * state.std():
+                why = "is nearly the state"
         if why:
             yield f"dimension {place}{f' ({names[place]})' if names[place] else ''} {why}"
-
-
-def _follows(values: Float[np.ndarray, " N"], state: Float[np.ndarray, " N"]) -> bool:
-    """Returns whether values roughly equal the state; real steps would be as far from the state as zero is."""
-    return bool(np.sqrt(np.mean(np.square(values - state))) < _FOLLOWS * state.std())
 
 
 def flat_names(names: Any, width: int) -> list[str]:

@@ -70,14 +70,17 @@ def record_start(run: Run, command: str) -> list[str]:
     starts = read_starts(run.directory)
     write_json(run.directory / NAME, [*starts, now])
     before = starts[-1] if starts else {}
-    return [name for name in DECIDE if any(_differ(old, now[name].get(k)) for k, old in before.get(name, {}).items())]
-
-
-def _differ(before: Any, now: Any) -> bool:
-    """Returns whether two entries differ in more than the path of the data."""
-    if isinstance(before, dict) and isinstance(now, dict):
-        return before | {"path": ""} != now | {"path": ""}
-    return before != now
+    changed = []
+    for name in DECIDE:
+        for key, old in before.get(name, {}).items():
+            new = now[name].get(key)
+            if isinstance(old, dict) and isinstance(new, dict):
+                old = old | {"path": ""}  # the data may have moved
+                new = new | {"path": ""}
+            if old != new:
+                changed.append(name)
+                break
+    return changed
 
 
 def record_data(run: Run) -> None:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from rsjax.artifact import Mark, is_finished, make_once, read_mark
-from rsjax.config import Config, ConfigError, EvalConfig, content_key, from_dict, sampling_settings, to_dict
+from rsjax.config import Config, ConfigError, content_key, from_dict, sampling_settings, to_dict
 from rsjax.data.store import MANIFEST, Store, StoreError, open_store
 from rsjax.data.token_sets import tokenizer_key, tokens_key
 from rsjax.errors import UserError
@@ -117,7 +117,9 @@ class Run:
             keys["depth_estimator"] = content_key(RECIPE, "depth_estimator", key, cfg.eval.simulator_steps)
         evaluation = cfg.eval
         with suppress(UserError):  # a file that cannot be read: the evaluation reports what is wrong
-            evaluation = _hashed(cfg.eval)
+            from rsjax.tools.pipeline.metric_files import by_content  # here, because it loads jax
+
+            evaluation = by_content(cfg.eval)
         settings: dict[str, tuple[Any, ...]] = {
             "tokenizer": (cfg.autoencoder, cfg.tokenizer_train),
             "tokens": cfg.model.token_shifts,
@@ -261,13 +263,6 @@ class Run:
         folder = self.directory / stage
         with make_once(folder, self.keys()[stage], refuse=None, again=True, keep=True, locked=False):
             yield folder
-
-
-def _hashed(settings: EvalConfig) -> EvalConfig:
-    """Returns the settings with paths of weights replaced by content hashes."""
-    from rsjax.tools.pipeline.metric_files import by_content  # here, because it loads jax
-
-    return by_content(settings)
 
 
 def _deciding(value: Any, name: str) -> Iterator[tuple[str, Any]]:

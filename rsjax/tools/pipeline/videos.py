@@ -8,15 +8,15 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
-from rsjax.clip import GENERATED_MARK, Video
+from rsjax.clip import GENERATED_MARK
 from rsjax.config import Config
 from rsjax.config.config_fields import with_values
 from rsjax.data.clips import Clips
-from rsjax.data.store import Record, Source
+from rsjax.data.store import Source
 from rsjax.errors import UserError
 from rsjax.files import placeholder, regular, write_file
 from rsjax.models.base import create_model
@@ -114,7 +114,13 @@ def write_videos(
         if foreign is not None or len(actions) > len(clip["rgb"]):  # there is no true video to show beside it
             write(path, made.rgb[0], fps, scale, GENERATED_MARK)
         else:
-            write(path, _side_by_side(clip, made, number), fps, 1, GENERATED_MARK)
+            shown = len(made.rgb[0])
+            depth = {}
+            if made.depth is not None:
+                depth = {"true_depth": clip["depth"][:shown], "predicted_depth": made.depth[0]}
+            unit = clip["provenance"].get("depth_unit") or "metres"
+            sides = {"truth": clip["rgb"][:shown], "prediction": made.rgb[0], **depth}
+            write(path, animation(ClipFigure(title=f"clip {number}", **sides, depth_unit=unit)), fps, 1, GENERATED_MARK)
         yield path
 
 
@@ -221,12 +227,3 @@ def resampled(trained: TrainedModel, sample: dict[str, Any]) -> TrainedModel:
     model = dataclasses.replace(trained.config.model, sample=with_values(settings, sample))  # type: ignore[call-arg]
     config = dataclasses.replace(trained.config, model=model)
     return dataclasses.replace(trained, config=config, model=create_model(config))
-
-
-def _side_by_side(clip: Record, made: Video, number: int) -> UInt8[np.ndarray, "T H W 3"]:
-    shown = len(made.rgb[0])
-    depth = {}
-    if made.depth is not None:
-        depth = {"true_depth": clip["depth"][:shown], "predicted_depth": made.depth[0]}
-    figure = ClipFigure(title=f"clip {number}", truth=clip["rgb"][:shown], prediction=made.rgb[0], **depth)
-    return animation(dataclasses.replace(figure, depth_unit=clip["provenance"].get("depth_unit") or "metres"))

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Int32
+from jaxtyping import Bool, Float, Int32
 
 from rsjax.clip import Clip
 from rsjax.config import SimConfig, to_dict
@@ -240,7 +240,11 @@ def run_episode(sim: Simulator, config: SimConfig, plan: EpisodePlan) -> Clip:
         openings.append(sim.opening)
         if frame == 0:
             bodies = sim.segment()
-            pixels = _track_pixels(config, sim, bodies, np.random.default_rng([seed, episode, 1]))
+            own_rng = np.random.default_rng([seed, episode, 1])  # the episode does not depend on where tracks start
+            if config.track_points == "grid":
+                pixels = grid_pixels(config.image_size, config.tracks, own_rng)
+            else:
+                pixels = object_pixels(bodies, sim.movable, sim.object_bodies, config.tracks, own_rng)
     tracks, visible = track(pixels, views[0].depth, bodies, shots)
     provenance = {
         "source": source_name(config),
@@ -305,15 +309,3 @@ def _in_the_image(camera: Camera, places: list[dict[str, Float[np.ndarray, " 3"]
     xy, depth = camera.project(np.array([[place[name] for name in names] for place in places]))
     placed = {name: xy[:, k].tolist() for k, name in enumerate(names)}
     return placed | {f"{names[0]}_width": width / (camera.extent * float(depth[0, 0]))}
-
-
-def _track_pixels(
-    config: SimConfig, sim: Simulator, bodies: Int32[np.ndarray, "S S"], rng: np.random.Generator
-) -> Int[np.ndarray, "N 2"]:
-    """Returns the pixels to track.
-
-    ``rng`` serves this choice alone, so that the episode does not depend on where tracks start.
-    """
-    if config.track_points == "grid":
-        return grid_pixels(config.image_size, config.tracks, rng)
-    return object_pixels(bodies, sim.movable, sim.object_bodies, config.tracks, rng)

@@ -168,10 +168,10 @@ class Expert:
         return targets.get(self._phase, self._goal), CLOSE if self._phase in ("grasp", "carry") else OPEN
 
 
-def yaw_action(state: LiftState) -> float:
-    """Returns the turn about the vertical that brings the fingers parallel to the cube's sides."""
+def yaw_action(state: LiftState, turn: float = 0.0) -> float:
+    """Returns the turn about the vertical that brings the fingers to this angle with the cube's sides, in radians."""
     # the cube looks the same after a quarter turn
-    error = (state.cube_yaw - state.gripper_yaw + np.pi / 4) % (np.pi / 2) - np.pi / 4
+    error = (state.cube_yaw + turn - state.gripper_yaw + np.pi / 4) % (np.pi / 2) - np.pi / 4
     return float(np.clip(TURN_GAIN * error, -0.5, 0.5))
 
 

@@ -15,7 +15,7 @@ from rsjax.tools.sim.collect import collect, collection_key
 from rsjax.tools.sim.contacts import collect_contacts, contact_splits
 from rsjax.tools.sim.episode import EpisodePlan, clip_seed, run_episode
 from rsjax.tools.sim.expert import OPEN, LiftState
-from rsjax.tools.sim.lift import LiftSim
+from rsjax.tools.sim.lift import NEAR, LiftSim
 from rsjax.tools.sim.panda import REACH, STEP
 from rsjax.tools.sim.recipes.grasps import GROUP, HEIGHT, PAUSE, SHORT
 from rsjax.tools.sim.recipes.plans import RECIPES, held_out_plans, scripted, training_plans
@@ -163,3 +163,19 @@ def test_groups_of_grasps_beside_the_cube_differ_in_height_and_their_episodes_do
     assert low <= heights.min() < low + 0.003 and high - 0.003 < heights.max() <= high
     pauses = np.array([plan.manner.pause for plan in plans])  # type: ignore[union-attr]
     assert (pauses.min(), pauses.max()) == (0, PAUSE) and 0.3 < stops.mean() < 0.7
+
+
+def test_misses_go_farther_along_the_cameras_line_of_sight_and_half_of_the_groups_are_turned() -> None:
+    plans = [scripted(CONFIG, "grasps", place, f"{place}") for place in range(200 * GROUP)]
+    offsets = np.array([plan.manner.offset for plan in plans]).reshape(200, GROUP, 3)  # type: ignore[union-attr]
+    turns = np.array([plan.manner.turn for plan in plans]).reshape(200, GROUP)  # type: ignore[union-attr]
+    assert (turns == turns[:, :1]).all() and np.abs(turns).max() < np.pi / 4
+    assert 0.4 < (turns[:, 0] != 0).mean() < 0.6
+    farthest = offsets[:, -1, :2]
+    distance = np.hypot(*farthest.T)
+    eye, point = np.array(NEAR[1]), np.array(NEAR[2])
+    line = (point - eye)[:2] / np.linalg.norm((point - eye)[:2])
+    beyond = distance > 0.056
+    assert 0.25 < beyond.mean() < 0.5 and 0.095 < distance.max() <= 0.1
+    along = farthest[beyond] @ line / distance[beyond]
+    assert (np.abs(along) > np.cos(0.41)).all() and 0.3 < (along > 0).mean() < 0.7, "before the cube and behind it"

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rsjax.tools.sim.expert import GAIN, OPEN, ArmState, LiftState, next_noise, yaw_action
+from rsjax.tools.sim.lift import NEAR
 
 See: TypeAlias = Callable[[], LiftState]  # returns the current state
 Moves: TypeAlias = Iterator[Float[np.ndarray, " 7"]]  # the action of each control step
@@ -86,10 +87,22 @@ def go(
         yield towards(see(), point, finger, speed)
 
 
-def hover(see: See, above: Float[np.ndarray, " 3"], speed: float, steps: int, near: float = 0.02) -> Moves:
-    """Moves the open gripper to a place relative to the cube, turned like the cube, for at most ``steps`` steps."""
+def hover(
+    see: See, above: Float[np.ndarray, " 3"], speed: float, steps: int, near: float = 0.02, turn: float = 0.0
+) -> Moves:
+    """Moves the open gripper to a place relative to the cube for at most ``steps`` steps.
+
+    Args:
+        turn: angle between the fingers and the cube's sides, radians.
+    """
     for _ in range(steps):
         point = see().cube + above
         if np.abs(see().gripper - point).max() < near:
             return
-        yield towards(see(), point, OPEN, speed, yaw_action(see()))
+        yield towards(see(), point, OPEN, speed, yaw_action(see(), turn))
+
+
+def sight() -> float:
+    """Returns the direction in which the camera "near" looks, as an angle about the vertical, radians."""
+    _, eye, point, _ = NEAR
+    return float(np.arctan2(point[1] - eye[1], point[0] - eye[0]))
