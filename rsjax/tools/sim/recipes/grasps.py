@@ -4,27 +4,26 @@ The position of the fingers alone decides whether a grasp succeeds, since the ep
 start, height, turn, times, speed, noise, and what follows the closing. Groups differ in height and in times, because a
 model that has seen most grasps at one height, or all without a pause, takes others for misses.
 
-Half of the groups beside the cube part along the camera's line of sight. There a policy errs most, because a picture
-hardly shows how far away the fingers are; a model that has seen no such misses lets them succeed.
+In half of the groups the gripper turns aside over the cube. In the others the expert itself errs about the cube, and
+goes to the wrong place directly, as a policy does that learned from it. Without these, a model can tell most misses by
+their manner, and lets such a policy's misses succeed.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from jaxtyping import Float
 
-from rsjax.tools.sim.expert import CLOSE, OPEN
-from rsjax.tools.sim.recipes.script import Moves, Scripted, See, go, hover, sight, stay
+from rsjax.tools.sim.expert import CLOSE, OPEN, Expert, LiftState, Manner
+from rsjax.tools.sim.recipes.script import Moves, Scripted, See, go, hover, stay
 
 # Distances from the cube's centre at which the fingers close, metres: an interval for each episode of a group.
-BESIDE = ((0.0, 0.018), (0.02, 0.03), (0.03, 0.04), (0.04, 0.055))
-SIGHT = ((0.0, 0.018), (0.02, 0.03), (0.03, 0.055), (0.055, 0.1))  # along the line of sight
+BESIDE = ((0.0, 0.018), (0.02, 0.03), (0.03, 0.055), (0.055, 0.1))
 ABOVE = ((0.0, 0.018), (0.019, 0.027), (0.027, 0.036), (0.036, 0.06))
 GROUP = len(BESIDE)
 HEIGHT = (-0.012, 0.024)  # above the cube's centre, up to its edge: where the fingers of a group close beside it
 ABOVE_SHARE = 0.25  # of the groups; the others close beside the cube
-SIGHT_SHARE = 0.5  # of those that close beside it
-AROUND_SIGHT = 0.4  # radians to either side of the line of sight
-TURNED_SHARE = 0.5  # of the groups: the fingers are not parallel to the cube's sides
+MISTAKEN_SHARE = 0.5  # of the groups: the expert errs
 PAUSE = 14  # control steps over the point of closing, at most
 STOP_SHARE = 0.5  # of the groups: the fingers close where they have come to, not yet at the point
 SHORT = 0.01  # as far above the point, metres; so the point lies lower by this
@@ -73,35 +72,78 @@ class GraspManner:
         yield from go(see, point + np.array(self.carry), CLOSE, self.speed, steps=60)
 
 
-def grasps(rng: np.random.Generator, number: int) -> GraspManner:
+@dataclass(frozen=True)
+class MistakenManner(Manner):
+    """The expert's manner, with an error about the cube.
+
+    Attributes:
+        offset: from the cube's centre to the point where the fingers close, the error included.
+        turn: by how much it errs about the cube's turn, radians.
+    """
+
+    turn: float
+
+    def expert(self, rng: np.random.Generator) -> Expert:
+        """Returns the policy of an episode; ``rng`` draws the noise."""
+        return Mistaken(self, rng)
+
+
+class Mistaken(Expert):
+    """The expert, which sees the cube turned."""
+
+    manner: MistakenManner
+
+    def act(self, state: LiftState) -> Float[np.ndarray, " 7"]:
+        """Returns the next action."""
+        return super().act(replace(state, cube_yaw=state.cube_yaw + self.manner.turn))
+
+
+def grasps(rng: np.random.Generator, number: int) -> GraspManner | MistakenManner:
     """Draws a group of grasps, and returns one of it: its ``offset`` alone depends on the episode's number."""
-    angle = rng.uniform(0, 2 * np.pi)
-    height = rng.uniform(*HEIGHT)
-    stops = bool(rng.random() < STOP_SHARE)
-    turned = bool(rng.random() < TURNED_SHARE)
+    mistaken = rng.random() < MISTAKEN_SHARE
+    stops = mistaken or bool(rng.random() < STOP_SHARE)
     intervals = np.array(BESIDE)
+    angle = rng.uniform(0, 2 * np.pi)
+    direction = np.array([np.cos(angle), np.sin(angle), 0])
+    height = rng.uniform(*HEIGHT)
     if rng.random() < ABOVE_SHARE:
         intervals = np.array(ABOVE)
         direction = np.array([0, 0, 1])
         height = -0.004
-    else:
-        if rng.random() < SIGHT_SHARE:
-            intervals = np.array(SIGHT)
-            angle = sight() + rng.choice([0, np.pi]) + rng.uniform(-AROUND_SIGHT, AROUND_SIGHT)
-        direction = np.array([np.cos(angle), np.sin(angle), 0])
-    height -= SHORT * stops
     distances = rng.uniform(intervals[:, 0], intervals[:, 1])
     x, y, z = distances[number % GROUP] * direction
+    offset = (float(x), float(y), float(z + height - SHORT * stops))
+    turn = float(rng.choice([0, rng.uniform(-np.pi / 4, np.pi / 4)]))
+    carry = (float(rng.uniform(-0.04, 0.1)), float(rng.uniform(-0.1, 0.1)), float(rng.uniform(0.1, 0.2)))
+    speed = float(rng.uniform(0.75, 1.0))
+    noise = float(rng.uniform(0.0, 0.1))
+    delay = int(rng.integers(0, 4))
+    squeeze = int(rng.integers(5, 8))
+    above = float(rng.uniform(0.06, 0.1))
+    if mistaken:
+        return MistakenManner(
+            mode="grasps",
+            speed=speed,
+            noise=2 * noise,
+            turn_noise=0.02,
+            delay=delay,
+            hover=above,
+            offset=offset,
+            squeeze=squeeze,
+            carry=carry,
+            release=-1,
+            turn=turn,
+        )
     return GraspManner(
         mode="grasps",
-        hover=float(rng.uniform(0.06, 0.1)),
-        offset=(float(x), float(y), float(z + height)),
-        turn=float(turned * rng.uniform(-np.pi / 4, np.pi / 4)),
+        hover=above,
+        offset=offset,
+        turn=turn,
         pause=int(rng.integers(0, PAUSE + 1)),
         stops=stops,
-        speed=float(rng.uniform(0.75, 1.0)),
-        noise=float(rng.uniform(0.0, 0.1)),
-        delay=int(rng.integers(0, 4)),
-        squeeze=int(rng.integers(5, 8)),
-        carry=(float(rng.uniform(-0.04, 0.1)), float(rng.uniform(-0.1, 0.1)), float(rng.uniform(0.1, 0.2))),
+        speed=speed,
+        noise=noise,
+        delay=delay,
+        squeeze=squeeze,
+        carry=carry,
     )

@@ -9,13 +9,12 @@ from functools import partial
 import numpy as np
 
 from rsjax.tools.sim.expert import CLOSE, OPEN, yaw_action
-from rsjax.tools.sim.recipes.script import Moves, Scripted, See, sight, stay, towards
+from rsjax.tools.sim.recipes.script import Moves, Scripted, See, stay, towards
 
 PLAN = 8  # control steps between two looks at the cube, as between a Diffusion Policy's plans
-# Metres: standard deviation of a useless policy's error in an attempt, along the camera's line of sight over the table,
-# across it, and upwards. A picture shows the place along the line of sight worst.
-BIAS = (0.08, 0.04, 0.01)
-JITTER = 0.03  # metres: along each horizontal axis, of the error that changes with every look
+BIAS = 0.05  # metres: standard deviation, along each horizontal axis, of a useless policy's error in an attempt
+JITTER = 0.03  # metres: likewise, of the error that changes with every look
+STEADY_SHARE = 0.5  # of the policies: they err without hesitation, so that nothing but the place tells it
 
 
 @dataclass(frozen=True)
@@ -25,6 +24,7 @@ class NoviceManner:
     Attributes:
         skill: 0 is useless, 1 as good as the script.
         speed, noise: as in :class:`rsjax.tools.sim.expert.Manner`.
+        jitter: 1 if the error changes with every look, 0 if not.
         turn: angle between the fingers and the cube's sides, radians.
         early: height above the grasp at which the fingers begin to close.
         carry: displacement after the fingers have closed.
@@ -34,6 +34,7 @@ class NoviceManner:
     skill: float
     speed: float
     noise: float
+    jitter: int
     turn: float
     early: float
     carry: tuple[float, float, float]
@@ -58,11 +59,13 @@ class NoviceManner:
 def novices(rng: np.random.Generator, number: int) -> NoviceManner:
     """Draws the attempts of one policy, whatever the episode's number."""
     skill = float(rng.random())
+    jitter = int(rng.random() >= STEADY_SHARE)
     return NoviceManner(
         mode="novices",
         skill=skill,
         speed=float(rng.uniform(0.5 + 0.3 * skill, 1.0)),
-        noise=float((1 - skill) * rng.uniform(0.0, 0.3)),
+        noise=float(jitter * (1 - skill) * rng.uniform(0.0, 0.3)),
+        jitter=jitter,
         turn=float(rng.choice([0, 1]) * rng.uniform(-np.pi / 4, np.pi / 4)),
         early=float(abs(rng.normal(0, 0.03 * (1 - skill)))),
         carry=(float(rng.uniform(-0.04, 0.1)), float(rng.uniform(-0.1, 0.1)), float(rng.uniform(0.1, 0.2))),
@@ -71,13 +74,11 @@ def novices(rng: np.random.Generator, number: int) -> NoviceManner:
 
 def reach(manner: NoviceManner, rng: np.random.Generator, see: See) -> Moves:
     """Moves over the cube and down to it, for as long as the fingers are not where they are to close."""
-    along = np.array([np.cos(sight()), np.sin(sight())])
-    across = np.array([-along[1], along[0]])
-    ahead, aside, up = (1 - manner.skill) * np.array(BIAS) * rng.standard_normal(3)
-    wrong = np.array([*(ahead * along + aside * across), up])
+    wrong = (1 - manner.skill) * np.array([BIAS, BIAS, 0.01]) * rng.standard_normal(3)
+    jitter = (1 - manner.skill) * manner.jitter * np.array([JITTER, JITTER, 0.3 * JITTER])
     height = 0.07
     for _ in range(6):
-        perceived = see().cube + wrong + (1 - manner.skill) * JITTER * rng.standard_normal(3) * np.array([1, 1, 0.3])
+        perceived = see().cube + wrong + jitter * rng.standard_normal(3)
         for _ in range(PLAN):
             turn = yaw_action(see(), manner.turn)
             yield towards(see(), perceived + np.array([0, 0, height]), OPEN, manner.speed, turn)

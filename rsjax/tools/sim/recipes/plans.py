@@ -36,12 +36,12 @@ class Recipe:
 
 
 RECIPES = {
-    "grasps": Recipe(grasps.grasps, 10_000_000, grasps.GROUP, version=6),
+    "grasps": Recipe(grasps.grasps, 10_000_000, grasps.GROUP, version=8),
     "pushes": Recipe(pushes.pushes, 20_000_000),
     "slips": Recipe(slips.slips, 30_000_000),
     "driving": Recipe(driving.driving, 40_000_000),
-    "novices": Recipe(novices.novices, 50_000_000, version=2),
-    "midway": Recipe(midway.midway, 60_000_000, lead=midway.LEAD, version=3),
+    "novices": Recipe(novices.novices, 50_000_000, version=3),
+    "midway": Recipe(midway.midway, 60_000_000, lead=midway.LEAD, version=4),
 }
 
 

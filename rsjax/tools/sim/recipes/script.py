@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Float
 
 from rsjax.tools.sim.expert import GAIN, OPEN, ArmState, LiftState, next_noise, yaw_action
-from rsjax.tools.sim.lift import NEAR
 
 See: TypeAlias = Callable[[], LiftState]  # returns the current state
 Moves: TypeAlias = Iterator[Float[np.ndarray, " 7"]]  # the action of each control step
@@ -100,9 +99,3 @@ def hover(
         if np.abs(see().gripper - point).max() < near:
             return
         yield towards(see(), point, OPEN, speed, yaw_action(see(), turn))
-
-
-def sight() -> float:
-    """Returns the direction in which the camera "near" looks, as an angle about the vertical, radians."""
-    _, eye, point, _ = NEAR
-    return float(np.arctan2(point[1] - eye[1], point[0] - eye[0]))
