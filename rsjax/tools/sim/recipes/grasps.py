@@ -124,7 +124,7 @@ def grasps(rng: np.random.Generator, number: int) -> GraspManner | MistakenManne
         return MistakenManner(
             mode="grasps",
             speed=speed,
-            noise=2 * noise,
+            noise=2 * noise,  # up to 0.2, as the expert's
             turn_noise=0.02,
             delay=delay,
             hover=above,
