@@ -58,12 +58,8 @@ def train_step(
     new = (params, opt_state, ema, model.next_extra(state.extra, metrics))
     old = (state.params, state.opt_state, state.ema, state.extra)
     params, opt_state, ema, extra = jax.tree.map(lambda new, old: jnp.where(finite, new, old), new, old)
-
-    def is_schedule(path: tuple[object, ...], value: object) -> bool:
-        return getattr(path[-1], "tuple_name", "") == "ScaleByScheduleState"
-
     # The learning rate schedule counts skipped steps; otherwise its restarts would come late.
-    opt_state = optax.tree_utils.tree_set(opt_state, is_schedule, count=state.step + 1)
+    opt_state = optax.tree_utils.tree_set(opt_state, _is_schedule, count=state.step + 1)
     skipped = state.skipped + ~finite
     metrics |= {
         "grad_norm": grad_norm,
@@ -161,3 +157,7 @@ def accumulated_gradient(
 def as_numbers(metrics: Metrics) -> dict[str, float]:
     """Returns a step's metrics as numbers, after waiting for the step."""
     return {name: float(value) for name, value in jax.device_get(metrics).items()}
+
+
+def _is_schedule(path: tuple[object, ...], value: object) -> bool:
+    return getattr(path[-1], "tuple_name", "") == "ScaleByScheduleState"
