@@ -45,11 +45,11 @@ def main() -> None:
     options = parse_options(sys.argv[1:], "rsjax improve", Options.__doc__ or "", Options())
     from rsjax.tools.policies.policy import load_policy
     from rsjax.tools.policies.policy_training import train_policy
-    from rsjax.tools.policies.run_data import RunData, sized_policy
+    from rsjax.tools.policies.run_data import RunData, sized_policy, with_clips
     from rsjax.tools.policies.studies.improvement import improve
     from rsjax.tools.policies.studies.trials import open_lift
 
-    run = RunData(options.run, options.data_dir)
+    run = RunData(with_clips(options.run), options.data_dir)
     out = options.out or options.run / "improve"
     settings = part(options, Improvement)
     trials = part(options, Trials)

@@ -42,11 +42,11 @@ def main() -> None:
     tune_process()
     options = parse_options(sys.argv[1:], "rsjax policy_learning", Options.__doc__ or "", Options())
     from rsjax.tools.policies.demos import Demos
-    from rsjax.tools.policies.run_data import RunData, sized_policy, synthetic_demos
+    from rsjax.tools.policies.run_data import RunData, sized_policy, synthetic_demos, with_clips
     from rsjax.tools.policies.studies.policy_learning import learn
     from rsjax.tools.policies.studies.trials import open_lift
 
-    run = RunData(options.run, options.data_dir)
+    run = RunData(with_clips(options.run), options.data_dir)
     out = options.out or options.run / "policy_learning"
     config = sized_policy(options.size, options.steps)
     learning = part(options, Learning)

@@ -51,8 +51,9 @@ def main() -> None:
     total = options.episodes * len(policies)
     numbers = {"train": range(FIRST, FIRST + total)}
     keys = str([policy.key for policy in policies.values()])
-    folder = (options.out or options.run / "recorded") / content_key("recorded", config, keys, total)
-    with closing(SimulatorWorld.lift(config, min(options.together, options.episodes))) as world:
+    together = min(options.together, options.episodes)  # what a policy draws depends on it
+    folder = (options.out or options.run / "recorded") / content_key("recorded", 2, config, keys, total, together)
+    with closing(SimulatorWorld.lift(config, together)) as world:
         store = rollouts(policies, world, config, numbers, config.frames - 1, folder, "record")
     share = store.manifest["success_share"]
     print(f"{total} episodes, {100 * share:.0f} % end in success")

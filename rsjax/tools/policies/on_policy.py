@@ -18,6 +18,7 @@ from rsjax.artifact import make_once
 from rsjax.config import SimConfig, content_key
 from rsjax.data.clips import first_clip
 from rsjax.data.codec import Record, decode, encode
+from rsjax.data.state_labels import knows_success
 from rsjax.data.store import Store, complete_key, open_store, write_store
 from rsjax.errors import UserError
 from rsjax.files import write_file
@@ -119,9 +120,7 @@ def cut(episodes: Store, own: Store, frames: int, out: Path) -> Store:
     Raises:
         UserError: the episodes are too short, or their pictures or actions have another size than the model's clips.
     """
-    key = content_key(
-        "on-policy clips", RECIPE, str(episodes.manifest.get("key")), str(own.manifest.get("key")), frames
-    )
+    key = content_key("on-policy clips", 2, str(episodes.manifest.get("key")), str(own.manifest.get("key")), frames)
     if complete_key(out) == key:
         return open_store(out)
     like = first_clip(own)
@@ -139,9 +138,10 @@ def cut(episodes: Store, own: Store, frames: int, out: Path) -> Store:
         "key": key,
         "on_policy": {"episodes": episodes.manifest.get("key"), "path": str(episodes.path.absolute())},
         "tasks": sorted({clip["task"] for clip in every}),
-        "success_share": float(np.mean([clip["success"][-1] for clip in every])),
-        "success_ever_share": float(np.mean([clip["success"].any() for clip in every])),
     }
+    if knows_success(episodes):
+        meta["success_share"] = float(np.mean([clip["success"][-1] for clip in every]))
+        meta["success_ever_share"] = float(np.mean([clip["success"].any() for clip in every]))
     write_store(out, "clips", clips, meta)
     return open_store(out)
 
@@ -164,7 +164,8 @@ def windows(record: Record, frames: int) -> list[Record]:
                 value = value[span].copy()
             clip[name] = value
         clip["actions"][0] = 0  # nothing led into the first frame
-        origin = dict(record["provenance"]) | {WINDOW: first}
+        origin = dict(record["provenance"])
+        origin[WINDOW] = origin.get(WINDOW, 0) + first
         if "objects" in origin:
             places = dict(origin["objects"])
             places |= {name: at[span] for name, at in places.items() if isinstance(at, list)}

@@ -174,6 +174,12 @@ def _pack(what: Collection, partial: Path, out: Path) -> None:
         split: [path for plan in plans if (path := _clip_file(partial, plan.name)).exists()]
         for split, plans in what.splits.items()
     }
+    for split, clips in files.items():
+        if what.splits[split] and not clips:
+            raise CollectError(
+                f"every episode of the split {split} failed in the simulator, the first one with: "
+                f"{next(iter(failures.values()))}; raise the number of episodes"
+            )
     source = source_name(what.config)
     config = to_dict(what.config)
     meta: dict[str, Any] = {"key": what.key, "source": source, "config": config, "quarantine": failures}

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rsjax.data.state_labels import knows_success
 from rsjax.data.store import encode_clip, open_store, write_store
 from rsjax.errors import UserError
 from rsjax.tools.policies.on_policy import act, cut, windows
@@ -35,6 +36,8 @@ def test_windows_cover_an_episode_and_begin_without_an_action() -> None:
         assert clip["provenance"]["objects"] == {"cube": [[t, t] for t in range(6)][span], "cube_width": 0.1}
     assert record["actions"][2].any() and len(record["rgb"]) == 6  # the episode stays as it was
     assert [clip["provenance"]["window"] for clip in windows(record, 3)] == [0, 2, 3]
+    record["provenance"]["window"] = 17  # itself from the middle of an episode
+    assert [clip["provenance"]["window"] for clip in windows(record, 3)] == [17, 19, 20]
     (whole,) = windows(record, 6)
     np.testing.assert_array_equal(whole["rgb"], record["rgb"])
 
@@ -54,7 +57,9 @@ def test_a_policy_acts_on_after_its_success_and_an_interrupted_call_resumes(tmp_
 
 def test_episodes_become_clips_in_the_units_of_the_models_own(tmp_path: Path) -> None:
     own = clips.store(tmp_path / "own")
-    meta = {"key": "episodes", "depth_range": [0.1, 9.0], "action_mean": [5.0], "action_std": [5.0]}
+    meta: dict[str, Any] = {"depth_range": [0.1, 9.0], "action_mean": [5.0], "action_std": [5.0]}
+    unlabelled = meta | {"key": "unlabelled"}
+    meta |= {"key": "episodes", "success_share": 1 / 3}
     long = [encode_clip(clips.clip(number, success=number == 1)) for number in range(3)]
     write_store(tmp_path / "episodes", "clips", {"train": long[:2], "test": long[2:]}, meta)
     episodes = open_store(tmp_path / "episodes")
@@ -64,6 +69,8 @@ def test_episodes_become_clips_in_the_units_of_the_models_own(tmp_path: Path) ->
         assert made.manifest[name] == own.manifest[name]
     assert made.manifest["success_share"] == pytest.approx(1 / 6)
     assert cut(episodes, own, 4, tmp_path / "cut").manifest == made.manifest
+    write_store(tmp_path / "unlabelled", "clips", {"train": long}, unlabelled)
+    assert not knows_success(cut(open_store(tmp_path / "unlabelled"), own, 4, tmp_path / "cut unlabelled"))
     for frames, wrong in ((7, "an episode has 6 frames; the model's clips have 7"),):
         with pytest.raises(UserError) as error:
             cut(episodes, own, frames, tmp_path / "wrong")

@@ -194,6 +194,14 @@ def test_many_failed_episodes_are_an_error(gl: str, tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == [".lift.partial.lock"]
 
 
+def test_a_split_without_an_episode_left_is_an_error(gl: str, tmp_path: Path) -> None:
+    config = SimConfig(episodes=20, test_episodes=1)
+    out = prepared(tmp_path, config, range(19, 20))
+    with pytest.raises(CollectError) as raised:
+        collect(config, out, lambda done, total: None)
+    assert "every episode of the split test failed in the simulator, the first one with" in str(raised.value)
+
+
 def test_episodes_of_another_configuration_are_not_reused(
     gl: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

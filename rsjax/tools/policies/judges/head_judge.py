@@ -73,5 +73,19 @@ def head_judge(trained: TrainedModel, run: Path | None = None) -> HeadJudge:
         )
     if run is None or not (run / FOLDER / VALIDATION).exists():
         return HeadJudge()
-    validation = read_json(run / FOLDER / VALIDATION, cure="validate them again: rsjax judge RUN --head")
-    return HeadJudge(int(validation.get("in_a_row", 1)), validation)
+    return HeadJudge(frames_in_a_row(run), _validation(run))
+
+
+def frames_in_a_row(run: Path) -> int:
+    """Returns in how many frames in a row a run's head must read success: as many as ``rsjax judge RUN --head`` chose.
+
+    Raises:
+        UserError: the file of the validation is damaged.
+    """
+    if not (run / FOLDER / VALIDATION).exists():
+        return HeadJudge().in_a_row
+    return int(_validation(run).get("in_a_row", 1))
+
+
+def _validation(run: Path) -> dict[str, Any]:
+    return read_json(run / FOLDER / VALIDATION, cure="validate them again: rsjax judge RUN --head")

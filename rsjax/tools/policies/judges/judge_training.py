@@ -94,10 +94,9 @@ def make_judge(
     settings = settings or JudgeSettings()
     trained = load(run)
     clips = _clips_of(trained, run, data_dir, store)
+    test_clips = _held_out(clips, settings)
     learned, fitted = _training(trained, clips, settings)
     judge = replace(train_judge(learned, fitted, settings.steps, settings.seed), in_a_row=settings.in_a_row)
-    numbers = spread(clips.source("test"), settings.validation_clips)
-    test_clips = [clip for _, clip in readable(clips.source("test"), numbers)]
     result = validation(trained, judge, test_clips) | {"settings": vars(settings), "judge": judge.key}
     judge.save(run / FOLDER)
     write_json(run / FOLDER / VALIDATION, result)
@@ -127,8 +126,7 @@ def validate_heads(
     settings = settings or JudgeSettings()
     trained = load(run)
     head_judge(trained, run)
-    source = _clips_of(trained, run, data_dir, store).source("test")
-    test_clips = [clip for _, clip in readable(source, spread(source, settings.validation_clips))]
+    test_clips = _held_out(_clips_of(trained, run, data_dir, store), settings)
     result = head_validation(trained, HeadJudge(settings.in_a_row), test_clips) | {"settings": vars(settings)}
     write_json(run / HEAD_FOLDER / VALIDATION, result)
     return result
@@ -174,6 +172,14 @@ def _clips_of(trained: TrainedModel, run: Path, data_dir: Path, store: Path | No
     else:
         config = trained.config
     return Run(config, run, data_dir).open_clips()
+
+
+def _held_out(clips: Store, settings: JudgeSettings) -> list[Record]:
+    source = clips.source("test")
+    records = [clip for _, clip in readable(source, spread(source, settings.validation_clips))]
+    if not records:
+        raise UserError(f"{clips.path}: no test clip can be read; a judge is validated on those")
+    return records
 
 
 def _training(trained: TrainedModel, clips: Store, settings: JudgeSettings) -> tuple[Footage, Footage]:

@@ -21,6 +21,7 @@ from rsjax.config.fields import require, require_range
 from rsjax.errors import UserError
 from rsjax.evaluation.statistics import wilson
 from rsjax.files import content_hash, write_file, write_json
+from rsjax.model_directory import locate, output_directory
 from rsjax.models.trained import TrainedModel
 from rsjax.progress import Progress
 from rsjax.tools.policies.judges.judge import frames_of, judge_key
@@ -275,7 +276,7 @@ def compare(
 
 def folder(run: Path, key: str) -> Path:
     """Returns the folder of the comparison with that key: ``result.json``, ``results.md`` and videos."""
-    return run / "plan" / key[:8]
+    return output_directory(locate(run), "plan") / key[:8]
 
 
 def results_text(result: dict[str, Any]) -> str:

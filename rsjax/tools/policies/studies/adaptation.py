@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from rsjax.artifact import Work, make_once
 from rsjax.config import ComponentConfig, Config, CurriculumStageConfig, TokenModelConfig, content_key
@@ -27,6 +28,7 @@ from rsjax.tools.pipeline.evaluations import EvaluationRequest, evaluate_run
 from rsjax.tools.pipeline.prepared import prepare_store
 from rsjax.tools.pipeline.run import Run
 from rsjax.tools.pipeline.stages import run_all
+from rsjax.tools.policies.judges.head_judge import frames_in_a_row
 from rsjax.tools.policies.judges.judge_training import FOLDER as JUDGE
 from rsjax.tools.policies.judges.trained_judge import VALIDATION
 from rsjax.tools.policies.on_policy import cut, rollouts
@@ -122,7 +124,10 @@ def adapt(data: RunData, behaviour: Behaviour, settings: Adaptation, out: Path, 
     scores_of(data.run)  # raises before anything is simulated if the run was not evaluated
     fixed = replace(settings, rounds=1)  # a second round may follow later
     policies = str({name: policy.key for name, policy in behaviour.policies.items()})
-    steps = str((behaviour.trials.max_steps, behaviour.trials.together))
+    together = behaviour.trials.together
+    if behaviour.simulator:
+        together = behaviour.simulator.count  # fewer if there are fewer trials; the episodes' draws depend on it
+    steps = str((behaviour.trials.max_steps, together))
     episodes = ""
     if behaviour.episodes:
         episodes = str(open_store(behaviour.episodes).manifest.get("key"))
@@ -280,7 +285,8 @@ def measure(
         row: dict[str, Any] = {"name": name, "run": str(run)}
         for kind, result in scores.items():
             gains = np.subtract(result.per_clip["psnr"], first[kind].per_clip["psnr"])
-            row[kind] = {"psnr": result.metrics["psnr"], "gain": asdict(bootstrap(gains)), "clips": len(gains)}
+            gain = bootstrap(by_episode(gains, result.clips))
+            row[kind] = {"psnr": result.metrics["psnr"], "gain": asdict(gain), "clips": len(gains)}
         results.append(row)
     about = {"settings": asdict(settings), "steps": steps, "run": str(data.run), "models": results}
     if behaviour.policies:
@@ -288,12 +294,19 @@ def measure(
         trials = behaviour.trials
         judge = behaviour.judge or data.run / JUDGE
         made = {name: RunData(run, data.data_dir) for name, run in runs.items()}
-        worlds = {name: partial(one.world, trials.together, judge) for name, one in made.items()}
+        rule = frames_in_a_row(data.run)  # no run of a round has one
+        worlds = {name: partial(one.world, trials.together, judge, in_a_row=rule) for name, one in made.items()}
         compare(behaviour.policies, behaviour.simulator, worlds, trials, out / "policy_evaluation")
         about["success"] = read_json(out / "policy_evaluation" / "results.json")["runs"]
     write_json(out / "results.json", about)
     write_file(out / "results.md", adaptation_tables(about).encode())
     return about
+
+
+def by_episode(values: Float[np.ndarray, " clips"], clips: Sequence[Mapping[str, Any]]) -> Float[np.ndarray, " N"]:
+    """Returns the mean of each episode's clips: those of one episode are alike, so only episodes are resampled."""
+    episodes = np.array([str(clip["episode"]) for clip in clips])
+    return np.array([values[episodes == episode].mean() for episode in np.unique(episodes)])
 
 
 def adaptation_tables(results: Mapping[str, Any]) -> str:

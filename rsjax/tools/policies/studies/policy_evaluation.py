@@ -147,8 +147,7 @@ def compare(
         UserError: fewer episodes are to be imagined than simulated.
     """
     imagined = imagined or trials.episodes
-    if imagined < trials.episodes:
-        raise UserError(f"--imagined is {imagined}; it must be at least --episodes, which is {trials.episodes}")
+    check_imagined(imagined, trials)
     seeds = [FIRST_SEED + number for number in range(imagined)]
     frames = first_frames(simulator, seeds, out / "starts.npz")
     true: dict[str, TrialResult] = {}
@@ -179,6 +178,12 @@ def compare(
         rows.append(row | {"like": (replicates or {}).get(run, run), "judge": summary(world.validation)})
         write_results(out, rows, trials)
     return results_of(rows, trials)
+
+
+def check_imagined(imagined: int, trials: Trials) -> None:
+    """Raises :class:`UserError` if fewer episodes are to be imagined than simulated."""
+    if imagined < trials.episodes:
+        raise UserError(f"--imagined is {imagined}; it must be at least --episodes, which is {trials.episodes}")
 
 
 def _videos(out: Path, run: str, name: str, trials: Trials) -> None:

@@ -25,7 +25,7 @@ from rsjax.files import disk_guard, read_json, write_atomically, write_json
 from rsjax.models.trained import TrainedModel
 from rsjax.tools.export.lerobot import LeRobotOptions, export_lerobot
 from rsjax.tools.policies.demos import Only, chooses, controls_of
-from rsjax.tools.policies.judges.judge import SUCCESS, UNINTERPRETABLE, Judge, judge_key, last_frames
+from rsjax.tools.policies.judges.judge import SUCCESS, UNINTERPRETABLE, Judge, frames_of, judge_key, last_frames
 from rsjax.tools.policies.judges.validation import summary
 from rsjax.tools.policies.worlds.actions import ActionRange, check_takes_actions
 from rsjax.tools.policies.worlds.model_world import model_key
@@ -94,7 +94,7 @@ def synthesize(
         UserError: the data set has no suitable clip, does not fit the model, or ``out`` holds other clips.
     """
     inputs = (model_key(trained), judge_key(judge), fingerprint(((limits.low, limits.high),)))
-    key = content_key(5, *inputs, str(store.manifest.get("key")), str(asdict(options)))
+    key = content_key(6, *inputs, str(store.manifest.get("key")), str(asdict(options)))
     if (out / SUMMARY).exists():
         finished: dict[str, Any] = read_json(out / SUMMARY, cure=f"delete {out}")
         if finished.get("key") != key:
@@ -266,7 +266,8 @@ def perturb(
 
 def labels(rgb: UInt8[np.ndarray, "B T S S 3"], judge: Judge) -> Int[np.ndarray, "B T"]:
     """Returns the index of the judge's label for each frame."""
-    return np.stack([judge(last_frames(rgb[:, : frame + 1])).argmax(-1) for frame in range(rgb.shape[1])], 1)
+    count = frames_of(judge)
+    return np.stack([judge(last_frames(rgb[:, : frame + 1], count)).argmax(-1) for frame in range(rgb.shape[1])], 1)
 
 
 def _file(folder: Path, number: int) -> Path:

@@ -104,9 +104,9 @@ def try_policy(
     """
     key = content_key("trials with actions", len(starts), trials.max_steps, trials.together, policy.key, world.key)
     with make_once(folder, key, refuse=OTHERS) as work:
-        success = work.metadata.setdefault("success", [])
-        uninterpretable = work.metadata.setdefault("uninterpretable", [])
-        unfamiliarity = work.metadata.setdefault("unfamiliarity", [])
+        success: list[bool] = work.metadata.get("success", [])
+        uninterpretable: list[bool] = work.metadata.get("uninterpretable", [])
+        unfamiliarity: list[float] = work.metadata.get("unfamiliarity", [])
         clipped = work.metadata.get("clipped", 0)
         comment = ""
         if isinstance(world, ModelWorld):
@@ -116,15 +116,16 @@ def try_policy(
             for first in range(len(success), len(starts), world.count):
                 group = starts[first : first + world.count]
                 episodes = run_episodes(world, policy.actor(first), group, trials.max_steps)
-                unfamiliarity += world.unfamiliarity(episodes, trials.max_steps + 1)
                 for number, episode in enumerate(episodes, first):
-                    success.append(bool(episode.success.any()))
-                    uninterpretable.append(episode.uninterpretable)
-                    clipped += episode.clipped
                     if number < trials.videos:
                         write_mp4(folder / f"episode-{number:02d}.mp4", episode.rgb, FPS, 4, comment)
                     if number < save_frames:
                         save_arrays(episode_file(folder, number), rgb=episode.rgb, actions=episode.actions)
+                # New lists: what was saved before stays as it was if this group is interrupted.
+                success = success + [bool(episode.success.any()) for episode in episodes]
+                uninterpretable = uninterpretable + [episode.uninterpretable for episode in episodes]
+                unfamiliarity = unfamiliarity + world.unfamiliarity(episodes, trials.max_steps + 1)
+                clipped += sum(episode.clipped for episode in episodes)
                 work.save(
                     success=success, uninterpretable=uninterpretable, clipped=clipped, unfamiliarity=unfamiliarity
                 )
@@ -151,22 +152,30 @@ def replayed(simulator: World, recorded: Path, trials: Trials, folder: Path, nam
         By episode, whether the simulator's task is done by these actions.
 
     Raises:
-        UserError: the results in ``folder`` are from other episodes or another simulator.
+        UserError: the results in ``folder`` are from other episodes or another simulator, or an episode's file is
+            missing.
     """
     actions = []
     for number in range(trials.episodes):
-        with np.load(episode_file(recorded, number)) as arrays:
+        file = episode_file(recorded, number)
+        if not file.exists():
+            raise UserError(f"{file}: not there, though these trials are finished; delete {recorded} to run them again")
+        with np.load(file) as arrays:
             actions.append(arrays["actions"][1:])
-    made = content_key("replayed", simulator.key, [rows.tolist() for rows in actions])
+    made = content_key("replayed", 2, simulator.key, [rows.tolist() for rows in actions])
     with make_once(folder, made, refuse=OTHERS) as work:
-        success: list[bool] = work.metadata.setdefault("success", [])
+        success: list[bool] = work.metadata.get("success", [])
         with Progress(f"{name}: replays", trials.episodes, "episodes", len(success)) as progress:
             for first in range(len(success), trials.episodes, simulator.count):
                 group = actions[first : first + simulator.count]
                 steps = min(max(map(len, group)) + HELD, trials.max_steps)
                 seeds = trials.seeds[first : first + simulator.count]
                 episodes = run_episodes(simulator, repeat_actions(group), seeds, steps)
-                success += [bool(episode.success.any()) for episode in episodes]
+                # Not what happens after its end while a longer episode of its group goes on.
+                ends = [len(one) + HELD + 1 for one in group]
+                success = success + [
+                    bool(episode.success[:end].any()) for episode, end in zip(episodes, ends, strict=True)
+                ]
                 work.save(success=success)
                 progress.update(len(success), success=sum(success))
     return success

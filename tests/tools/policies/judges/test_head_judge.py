@@ -14,11 +14,12 @@ from rsjax.config import StateHeadsConfig
 from rsjax.errors import UserError
 from rsjax.files import write_json
 from rsjax.models.base import TeacherForced
-from rsjax.tools.policies.judges.head_judge import HeadJudge, head_judge
+from rsjax.tools.policies.judges.head_judge import HeadJudge, frames_in_a_row, head_judge
 from rsjax.tools.policies.judges.judge import FAIL, HISTORY, SUCCESS, all_successes, frames_of
 from rsjax.tools.policies.judges.judge_training import head_validation
 from rsjax.tools.policies.judges.trained_judge import Footage, TrainedJudge, load_judge
 from rsjax.tools.policies.judges.validation import outcomes, validate, whole_clips
+from rsjax.tools.policies.run_data import RunData
 from rsjax.tools.policies.worlds.model_world import FirstFrame, ModelWorld
 from tests.tools.pipeline import toy
 from tests.tools.policies.judges.test_judge import footage
@@ -163,3 +164,8 @@ def test_heads_are_validated_on_true_frames_and_on_rollouts(tmp_path: Path) -> N
     assert result["generated"]["whole_clips"]["1"]["right"][0] == 1
     write_json(tmp_path / "judge_head" / "validation.json", result)
     assert head_judge(trained, tmp_path) == HeadJudge(2, json.loads(json.dumps(result)))
+    assert (frames_in_a_row(tmp_path), frames_in_a_row(tmp_path / "elsewhere")) == (2, 1)
+    data = RunData(tmp_path)
+    data.__dict__["trained"] = trained
+    assert data.world_judge(Path("head")) == data.world_judge(Path("head"), 2) == head_judge(trained, tmp_path)
+    assert data.world_judge(Path("head"), 1) == HeadJudge(1)  # as another run's, with which it is compared

@@ -22,7 +22,7 @@ from rsjax.tools.policies.judges.trained_judge import JudgeNetwork, TrainedJudge
 from rsjax.tools.policies.on_policy import FIRST_EPISODE
 from rsjax.tools.policies.policy_training import train_policy
 from rsjax.tools.policies.run_data import RunData
-from rsjax.tools.policies.studies.adaptation import Adaptation, adapted, steps_of
+from rsjax.tools.policies.studies.adaptation import Adaptation, adapted, by_episode, steps_of
 from rsjax.tools.policies.worlds.simulator_world import SimulatorWorld
 from rsjax.tools.sim.episode import clip_seed
 from tests.tools.pipeline.conftest import Commands, command, debug, shared
@@ -106,6 +106,11 @@ def test_scores_and_success_are_reported_before_and_after(place: Place) -> None:
     assert [row["run"] for row in found["success"]] == ["before", "round-1"]
     text = (place.out / "results.md").read_text()
     assert "| round-1 " in text and "same outcome" in text
+
+
+def test_clips_of_one_episode_count_once() -> None:
+    clips = [{"number": number, "episode": episode} for number, episode in enumerate("abbc")]
+    assert by_episode(np.array([1.0, 2.0, 4.0, 5.0]), clips).tolist() == [1.0, 3.0, 5.0]
 
 
 def test_a_second_round_starts_from_the_first_and_learns_from_both_rounds_episodes(

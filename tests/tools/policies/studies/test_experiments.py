@@ -17,9 +17,10 @@ from rsjax.tools.policies.studies import policy_learning as learning
 from rsjax.tools.policies.studies.improvement import Improvement, improve, mixed
 from rsjax.tools.policies.studies.policy_evaluation import compare
 from rsjax.tools.policies.studies.policy_learning import Learning, claims, learn
-from rsjax.tools.policies.studies.trials import Trials, first_frames
-from tests.tools.policies.toy import demos
-from tests.tools.policies.toy_worlds import ToyPolicy, imagined, simulated
+from rsjax.tools.policies.studies.trials import Trials, episode_file, first_frames, replayed, save_arrays, try_policy
+from rsjax.tools.policies.worlds.simulator_world import SimulatorWorld
+from tests.tools.policies.toy import CONTROLS, WIDTH, demos
+from tests.tools.policies.toy_worlds import ToyPolicy, ToySimulator, imagined, simulated
 from tests.tools.policies.toy_worlds import judge as toy_judge
 
 TRIALS = Trials(episodes=10, max_steps=4, together=5, videos=1)  # the dot begins in columns 3 … 4, 0 … 4, 0 … 2
@@ -115,6 +116,51 @@ def test_a_replay_tells_what_the_model_mistakes_from_what_the_policy_does_otherw
     assert len(again) == 6
     compare(policies, simulated(5), models, TRIALS, tmp_path)
     assert again == {path: path.stat().st_mtime_ns for path in again}
+
+
+class Coasting(ToySimulator):
+    """Its dot moves on by itself."""
+
+    def step(self, control: np.ndarray) -> None:
+        super().step(control)
+        self.place += 0.8 / CONTROLS
+
+
+def test_a_replay_does_not_depend_on_the_episodes_beside_it(tmp_path: Path) -> None:
+    trials = Trials(episodes=2, max_steps=12, together=2)
+    for number, steps in enumerate((2, 10)):
+        save_arrays(
+            episode_file(tmp_path, number), actions=np.full((1 + steps, CONTROLS * WIDTH), 0.3 / CONTROLS, np.float32)
+        )
+    found = {}
+    for count in (1, 2):
+        simulators: Any = [Coasting() for _ in range(count)]
+        world = SimulatorWorld(simulators, CONTROLS, WIDTH)
+        found[count] = replayed(world, tmp_path, trials, tmp_path / f"{count} at a time", "toy")
+    assert found[1] == found[2] == [False, True]
+    episode_file(tmp_path, 1).unlink()
+    with pytest.raises(UserError) as raised:
+        replayed(world, tmp_path, trials, tmp_path / "replayed", "toy")
+    assert "episode-01.npz: not there" in str(raised.value)
+    assert f"delete {tmp_path} to run them again" in str(raised.value)
+
+
+def test_trials_that_stop_within_a_group_go_on_as_if_they_had_not(tmp_path: Path) -> None:
+    policy: Any = ToyPolicy(1.0)
+
+    def tried(folder: Path) -> Any:
+        return try_policy(policy, simulated(5), TRIALS.seeds, TRIALS, folder, "toy", save_frames=10)
+
+    whole = tried(tmp_path / "whole")
+    blocked = episode_file(tmp_path / "stopped", 7)  # of the second group
+    blocked.mkdir(parents=True)
+    with pytest.raises((OSError, UserError)):
+        tried(tmp_path / "stopped")
+    blocked.rmdir()
+    assert tried(tmp_path / "stopped") == whole
+    assert len(whole.success) == len(whole.uninterpretable) == 10
+    names = [{path.name for path in (tmp_path / name).iterdir()} for name in ("whole", "stopped")]
+    assert names[0] == names[1]
 
 
 def test_more_imagined_trials_than_true_ones_correct_the_rate_by_the_pairs(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from rsjax.data.normalization import Normalization
 from rsjax.errors import UserError
 from rsjax.tools.policies.demos import load_demos
 from rsjax.tools.policies.studies import synthesis as module
-from rsjax.tools.policies.studies.synthesis import Synthesis, choose_clips, perturb, synthesize
+from rsjax.tools.policies.studies.synthesis import Synthesis, choose_clips, labels, perturb, synthesize
 from tests.tools.ingest.formats.reading import read_all
 from tests.tools.policies.toy import CONTROLS, SIZE, WIDTH, demo_store, picture
 from tests.tools.policies.toy_worlds import action_range, judge
@@ -44,6 +44,19 @@ def trained(store: Any, fails_at: int = -1, weight: float = 1.0) -> Any:
     return SimpleNamespace(
         config=config, model=SimpleNamespace(generate=generate), params={"w": weight}, assets=assets, calls=calls
     )
+
+
+def test_labels_are_a_judges_verdicts_on_the_video_so_far() -> None:
+    def verdicts(frames: np.ndarray) -> np.ndarray:
+        """Success is light in six frames in a row."""
+        light = frames[:, -6:].min((1, 2, 3, 4)) > 0
+        return np.stack([light, ~light, 0 * light], -1).astype(float)
+
+    wants: Any = verdicts
+    wants.in_a_row = 6
+    rgb = np.zeros((1, 12, SIZE, SIZE, 3), np.uint8)
+    rgb[:, 4:] = 255
+    assert labels(rgb, wants)[0].tolist() == [1] * 9 + [0] * 3
 
 
 @pytest.fixture
