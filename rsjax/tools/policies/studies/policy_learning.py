@@ -6,9 +6,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from rsjax.errors import UserError
-from rsjax.evaluation.statistics import Estimate, can_lose, share_difference, verdict, wilson
+from rsjax.evaluation.statistics import Estimate, can_lose, share_difference, verdict, welch, wilson
 from rsjax.files import write_file, write_json
 from rsjax.progress import stage
 from rsjax.tools.policies.config import PolicyConfig
@@ -153,7 +154,7 @@ def claims(rows: Sequence[dict[str, Any]], most: int) -> list[dict[str, Any]]:
     verdicts = []
     for claim, one, other, margin in wanted:
         if one != other and one in success and other in success:
-            interval = share_difference(success[one], success[other])
+            interval = difference(success[one], success[other])
             if can_lose(success[other], -margin):
                 holds = verdict(interval, "higher", margin)
             else:
@@ -162,6 +163,21 @@ def claims(rows: Sequence[dict[str, Any]], most: int) -> list[dict[str, Any]]:
                 {"claim": claim, "compares": [one, other], **asdict(interval), "margin": margin, "verdict": holds}
             )
     return verdicts
+
+
+def difference(one: Float[np.ndarray, "seeds episodes"], other: Float[np.ndarray, "seeds episodes"]) -> Estimate:
+    """Returns the difference of two rates of success: with the interval over trials or over trainings, the wider one.
+
+    More trials of one training do not tell how another training would end, so with two seeds or more the interval over
+    the seeds' rates (Welch's) counts too. With one seed, the interval is about this training alone.
+    """
+    trials = share_difference(one, other)
+    trainings = welch(one.mean(1), other.mean(1))
+    if trainings is None:
+        return trials
+    over = trainings.difference
+    assert trials.low is not None and trials.high is not None and over.low is not None and over.high is not None
+    return Estimate(trials.value, min(trials.low, over.low), max(trials.high, over.high))
 
 
 def learning_tables(rows: Sequence[dict[str, Any]], verdicts: Sequence[dict[str, Any]]) -> str:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from rsjax.errors import UserError
+from rsjax.evaluation.statistics import share_difference
 from rsjax.tools.policies.config import toy
 from rsjax.tools.policies.run_data import named
 from rsjax.tools.policies.studies import improvement
@@ -16,7 +17,7 @@ from rsjax.tools.policies.studies import policy_evaluation as comparison
 from rsjax.tools.policies.studies import policy_learning as learning
 from rsjax.tools.policies.studies.improvement import Improvement, improve, mixed
 from rsjax.tools.policies.studies.policy_evaluation import compare
-from rsjax.tools.policies.studies.policy_learning import Learning, claims, learn
+from rsjax.tools.policies.studies.policy_learning import Learning, claims, difference, learn
 from rsjax.tools.policies.studies.trials import Trials, episode_file, first_frames, replayed, save_arrays, try_policy
 from rsjax.tools.policies.worlds.simulator_world import SimulatorWorld
 from tests.tools.policies.toy import CONTROLS, WIDTH, demos
@@ -75,6 +76,18 @@ def test_without_a_difference_nothing_is_claimed() -> None:
     for rate, verdict in ((0, "cannot tell"), (0.9, "holds")):  # where nothing succeeds, nothing is as good as another
         alike = [row | {"success": [[number < 200 * rate for number in range(200)]]} for row in rows]
         assert [claim["verdict"] for claim in claims(alike, 8)] == [verdict]
+
+
+def test_trainings_that_differ_widen_the_interval_and_one_training_has_that_of_its_trials() -> None:
+    alike = np.tile([1.0, 1.0, 0.0, 0.0, 0.0], (3, 20))
+    better = alike.copy()
+    better[:, 2::5] = 1
+    uneven = better.copy()
+    uneven[0, 2::5] = 0  # the first training gained nothing
+    assert difference(better, alike) == share_difference(better, alike)  # the seeds agree
+    assert difference(uneven[:1], alike[:1]) == share_difference(uneven[:1], alike[:1])
+    plain, wide = share_difference(uneven, alike), difference(uneven, alike)
+    assert wide.value == plain.value and wide.low < 0 < plain.low < plain.high < wide.high  # type: ignore[operator]
 
 
 def test_a_model_that_moves_alike_ranks_alike(tmp_path: Path) -> None:
