@@ -1,5 +1,6 @@
 """Settings that must be made before jax is loaded, here and in the processes that tests start; shared fixtures."""
 
+import faulthandler
 import gc
 import importlib.util
 import os
@@ -42,6 +43,21 @@ CACHE = "JAX_COMPILATION_CACHE_DIR"
 made = "" if CACHE in os.environ else tempfile.mkdtemp(prefix="rsjax-tests-")
 os.environ.setdefault(CACHE, made)
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+
+
+TERMINAL = pytest.StashKey[int]()
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.stash[TERMINAL] = os.dup(2)  # while nothing is captured
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_exception_interact(node: pytest.Item | pytest.Collector) -> None:
+    """Times what follows a failure as well: pytest stops its clock there, and a hanging teardown would go unnoticed."""
+    if isinstance(node, pytest.Item):
+        seconds = float(node.config.getini("faulthandler_timeout"))
+        faulthandler.dump_traceback_later(seconds, file=node.config.stash[TERMINAL], exit=True)
 
 
 def pytest_unconfigure() -> None:

@@ -149,9 +149,11 @@ def test_a_killed_driver_takes_its_cluster_along_and_only_the_rest_is_run(tmp_pa
     program.write_text(PROGRAM)
     line = [sys.executable, str(program), str(tmp_path)]
     driver = subprocess.Popen(line, env=os.environ | {"PYTHONPATH": str(ROOT)})
-    wait_until(lambda: driver.poll() is not None or bool(list(tmp_path.rglob("items/clips/**/*.json"))), 300)
-    driver.kill()
-    driver.wait()
+    try:
+        wait_until(lambda: driver.poll() is not None or bool(list(tmp_path.rglob("items/clips/**/*.json"))), 300)
+    finally:
+        driver.kill()
+        driver.wait()
     pids = [path.name for path in (tmp_path / "pids").iterdir()]
     wait_until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in pids))
     marks = len(list(tmp_path.rglob("items/**/*.json")))
