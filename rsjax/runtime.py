@@ -207,6 +207,7 @@ def stop_signals() -> Iterator[list[int]]:
             signal.signal(number, handler)
         sys.unraisablehook = report
         signal.set_wakeup_fd(descriptor)
+        os.write(writable, bytes(1))  # a forked child may hold the pipe open
         os.close(writable)
         watch.join()
         os.close(readable)
@@ -227,7 +228,7 @@ def _watch(pipe: int) -> None:
             continue
         numbers = os.read(pipe, 64)
         now = time.monotonic()
-        if not numbers:  # the other end is closed
+        if not numbers or 0 in numbers:  # the end
             return
         if signal.SIGINT in numbers:
             interrupted = min(interrupted, now)

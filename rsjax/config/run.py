@@ -119,6 +119,12 @@ class Config:
         if self.model.uses_tokenizer and self.autoencoder is self.tokenizer:
             self.tokenizer.grid(clips.image_size)
         self.model.check(clips)
+        shortened = max((stage.frames for stage in self.train.curriculum), default=0)
+        require(
+            shortened <= clips.frames and (not shortened or isinstance(self.model, TokenModelConfig)),
+            f"a stage of train.curriculum takes {shortened} of {clips.frames} frames of a clip, and only families of "
+            f"tokens take fewer than all (this is {self.model.family}); lower its frames, or leave them out",
+        )
         require(
             not self.second_view or isinstance(self.model, TokenModelConfig),
             f"sim.second_view is {self.sim.second_view}, but models of the family {self.model.family} read one view; "

@@ -79,7 +79,8 @@ class ComponentConfig:
     tasks: tuple[str, ...] = ("*",)  # of the clips, in words
     difficulties: tuple[str, ...] = ("*",)  # labels of the store, such as simple and difficult
     scenes: tuple[str, ...] = ("*",)  # likewise, such as kitchen
-    store: str = ""  # a token store of the same tokenizer; empty: this run's own
+    # A token store of the same tokenizer; empty: this run's own. A run knows it by its path: give other clips another.
+    store: str = ""
     weight: float = 1.0  # share of the clips drawn, relative to the other components
     clips: int = 0  # use only this many of these clips, the first ones; 0: all
     # Depth and tracks to learn from: own, the clips' own; or for the world model on this run's own clips, tracks by

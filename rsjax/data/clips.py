@@ -4,6 +4,7 @@ Axes: B clips, T frames, H×W pixels, A action dimensions, N₀ tracks.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Sized
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -139,7 +140,7 @@ def load_clips(store: Store, count: int, split: str = "test") -> Clips:
 
 
 def frame_rate(clip: Record, manifest: Mapping[str, Any]) -> float | None:
-    """Returns the frames per second of a store's clips, from one of them; None if it is unknown.
+    """Returns the frames per second of a store's clips, from one of them; None if it is unknown or no number.
 
     Args:
         manifest: the store's manifest; for simulated clips it has the control steps between two frames.
@@ -148,10 +149,13 @@ def frame_rate(clip: Record, manifest: Mapping[str, Any]) -> float | None:
     frames = origin.get("frames", ())
     fps = origin.get("fps")
     control = origin.get("control_hz")
-    if fps and len(frames) > 1:
-        return float(fps) * (len(frames) - 1) / (frames[-1] - frames[0])
-    steps = (manifest.get("config") or {}).get("control_steps") or origin.get("control_steps")
-    return float(control) / steps if control and steps else None
+    with suppress(TypeError, ValueError, ZeroDivisionError):  # anybody may write a provenance
+        if fps and len(frames) > 1:
+            return float(fps) * (len(frames) - 1) / (frames[-1] - frames[0])
+        steps = (manifest.get("config") or {}).get("control_steps") or origin.get("control_steps")
+        if control and steps:
+            return float(control) / steps
+    return None
 
 
 def keeps_rate(clip: Record, manifest: Mapping[str, Any], fps: float) -> bool:

@@ -12,6 +12,7 @@ from rsjax.config import ComponentConfig, CurriculumStageConfig, LoopConfig, Tra
 from rsjax.data.codec import Record
 from rsjax.data.loader import Arrays, CurriculumStage, Loader, MixtureComponent, Readable, Transform, place_of
 from rsjax.data.quarantine import NAME, Quarantine
+from rsjax.data.state_labels import provenance_within
 from rsjax.data.store import Store, StoreError, open_store
 
 SPLIT = "train"
@@ -25,6 +26,7 @@ FRAME_AXES = {
     "visible": 1,
     "rgb_shifted": 1,
     "depth_shifted": 1,
+    "second": 0,
 }
 EVERYTHING = CurriculumStageConfig()
 
@@ -183,6 +185,7 @@ def first_frames(transform: Transform, frames: int, record: Record, rng: np.rand
     for name, axis in FRAME_AXES.items():
         if cut.get(name) is not None:
             cut[name] = np.take(cut[name], range(frames), axis=axis)
+    cut["provenance"] = provenance_within(record["provenance"], slice(frames))
     return transform(cut, rng)
 
 

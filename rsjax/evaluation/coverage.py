@@ -109,6 +109,8 @@ def nearest(
     """
     squares = np.square(bank, dtype=np.float64).sum(1)
     count = min(NEAREST, len(bank))
+    if without is not None:
+        count = min(count, int((~without).sum(1).min()))  # in a small bank
     means = []
     for start in range(0, len(rows), ROWS):
         part = rows[start : start + ROWS].astype(np.float64)
@@ -159,12 +161,13 @@ def make_coverage(trained: TrainedModel, store: Store, run: Path, clips: int = C
     folder = output_directory(run, FOLDER)
     key = coverage_key(trained, store, clips)
     with make_once(folder, key, refuse=None, wait=True) as work:
-        if not work.finished:
+        if not work.finished or (work.metadata.get("made", True) and _read(folder) is None):
             source = store.source("train")
             records = [record for _, record in readable(source, spread(source, clips))]
             batch = Clips.stacked(records, range(len(records)))
             first = trained.config.prompt_frames
             features = features_of(trained, batch.video, batch.actions, first)
+            work.save(made=features is not None and len(records) > 1)
             if features is not None and len(records) > 1:
                 made = Coverage.of(features, batch.actions[:, first:])
                 write_file(folder / FILE, encode({field.name: getattr(made, field.name) for field in fields(made)}))
@@ -176,6 +179,10 @@ def read_coverage(trained: TrainedModel, store: Store, run: Path, clips: int = C
     folder = output_directory(run, FOLDER)
     if not is_finished(folder, coverage_key(trained, store, clips)):
         return None
+    return _read(folder)
+
+
+def _read(folder: Path) -> Coverage | None:
     try:
         return Coverage(**decode(regular(folder / FILE).read_bytes()))
     except (OSError, ValueError, TypeError):

@@ -482,7 +482,10 @@ def mean_scores(repetitions: Sequence[ClipScores]) -> ClipScores:
         return repetitions[0]
 
     def mean(maps: Sequence[Mapping[str, PerClip]]) -> dict[str, PerClip]:
-        return {name: np.mean([each[name] for each in maps], axis=0) for name in maps[0]}
+        names = [
+            name for name in maps[0] if all(name in each for each in maps)
+        ]  # a correlation may be undefined in one
+        return {name: np.mean([each[name] for each in maps], axis=0) for name in names}
 
     values = {name: mean([each.values[name] for each in repetitions]) for name in repetitions[0].values}
     return ClipScores(values, repetitions[0].reasons, mean([each.best for each in repetitions]))

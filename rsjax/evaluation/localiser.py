@@ -22,6 +22,7 @@ from scipy.special import expit
 
 from rsjax.data.codec import Record
 from rsjax.data.shift import moved
+from rsjax.data.state_labels import recorded_objects
 from rsjax.evaluation.registry import Places
 from rsjax.layers.group_norm import GroupNorm
 from rsjax.progress import Progress
@@ -37,10 +38,10 @@ def recorded_places(clips: Sequence[Record]) -> tuple[Places, Float[np.ndarray, 
 
     They are in the clips' provenance. Returns None if one of the clips does not have them.
     """
-    objects = [clip["provenance"].get("objects") for clip in clips]
-    if not all(objects):
-        return None
+    objects = [recorded_objects(clip["provenance"]) for clip in clips]
     cube = "cube" if "cube" in objects[0] else "object"  # Meta-World's main object stands for the cube
+    if not all(name in each for each in objects for name in (cube, "gripper", f"{cube}_width")):
+        return None
     xy = np.stack([np.stack([each[name] for name in (cube, "gripper")], axis=1) for each in objects])
     lifted = np.stack([clip["success"] for clip in clips])
     return Places(np.clip(xy, 0, 1), lifted), np.array([each[f"{cube}_width"] for each in objects])

@@ -393,7 +393,7 @@ def _read_checksums(checkpoint: Path) -> dict[str, Any]:
 
 @dataclass
 class Best(ocm.PreservationPolicy):
-    """Keeps the checkpoint with the lowest metric, the newest of equal ones; keeps none if none has a metric.
+    """Keeps the checkpoint with the lowest metric, the first of equal ones; keeps none if none has a metric.
 
     Orbax's BestN reads the metrics from the checkpoints, where a damaged one stops it from opening the others.
 
@@ -406,8 +406,8 @@ class Best(ocm.PreservationPolicy):
     def should_preserve(
         self, checkpoints: Sequence[ocm.PolicyCheckpointInfo], *, context: ocm.PreservationContext
     ) -> list[bool]:
-        judged = [(self.metrics[info.step], -info.step) for info in checkpoints if info.step in self.metrics]
-        best = -min(judged)[1] if judged else None
+        judged = [(self.metrics[info.step], info.step) for info in checkpoints if info.step in self.metrics]
+        _, best = min(judged, default=(None, None))
         return [info.step == best for info in checkpoints]
 
 

@@ -47,6 +47,15 @@ def read(*argv: str) -> Config:
     return parse(argv, "train", "", NoOptions())[0]
 
 
+@pytest.mark.parametrize(("preset", "frames"), [("debug", 100), ("irasim_tiny", 4)])
+def test_frames_that_clips_or_families_do_not_have_are_refused(preset: str, frames: int) -> None:
+    config = presets.get(preset)
+    stages = (CurriculumStageConfig(frames=frames),)
+    with pytest.raises(ConfigError) as raised:
+        dataclasses.replace(config, train=dataclasses.replace(config.train, curriculum=stages))
+    assert f"a stage of train.curriculum takes {frames} of {config.clips.frames} frames" in str(raised.value)
+
+
 @settings(max_examples=40)
 @given(st.lists(STAGES, max_size=3).map(tuple))
 def test_reading_inverts_writing(stages: tuple[CurriculumStageConfig, ...]) -> None:

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from rsjax.config import ClipShape, ComponentConfig, CurriculumStageConfig, LoopConfig
 from rsjax.data.curriculum import check_stages, choose, first_frames, loader_factory
+from rsjax.data.state_labels import state_labels
 from rsjax.data.store import Store, StoreError, open_store, write_store
 from rsjax.models.roboscape.records import random_record
 from tests.curricula import PAPER, mixed, stage
@@ -199,13 +200,18 @@ def test_damage_is_counted_once_over_stages_and_survives_a_restart(tmp_path: Pat
 
 def test_a_stage_of_few_frames_reads_the_first_ones() -> None:
     record = random_record(np.random.default_rng(0), ClipShape(6, 64, 5, 3, 2), grid=4, code_bits=6)
-    record = record | {"depth": None}
+    second = np.arange(6 * 4 * 4).reshape(6, 4, 4)
+    objects = {"height": [0.1 * t for t in range(6)], "opening": [0.0] * 6, "cube_width": 3.0}
+    record = record | {"depth": None, "second": second, "provenance": record["provenance"] | {"objects": objects}}
     cut = first_frames(lambda record, rng: record, 4, record, np.random.default_rng(0))
     assert cut["rgb"].tolist() == record["rgb"][:4].tolist()
     assert cut["actions"].tolist() == record["actions"][:4].tolist()
     assert cut["tracks"].tolist() == record["tracks"][:, :4].tolist()
     assert cut["visible"].tolist() == record["visible"][:, :4].tolist()
     assert cut["depth"] is None
+    assert cut["second"].tolist() == second[:4].tolist()
+    np.testing.assert_array_equal(state_labels(cut)[:, 1:], state_labels(record)[:4, 1:])
+    assert cut["provenance"]["objects"]["cube_width"] == 3.0 and len(objects["height"]) == 6
     with pytest.raises(StoreError) as caught:
         first_frames(lambda record, rng: record, 7, record, np.random.default_rng(0))
     assert "takes 7 frames" in str(caught.value)

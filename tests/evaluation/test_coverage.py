@@ -65,6 +65,16 @@ def test_distances_are_those_of_a_loop_over_all_frames_of_other_clips() -> None:
     assert bank.of_frames(np.array(np.max(apart) + 1))[1] == 1
 
 
+@pytest.mark.parametrize(("clips", "frames"), [(2, 3), (3, 2), (4, 1)])
+def test_of_few_frames_as_many_count_as_other_clips_have(clips: int, frames: int) -> None:
+    rng = np.random.default_rng(0)
+    features, actions = rng.normal(size=(clips, frames, WIDTH)), rng.normal(size=(clips, frames, ACTIONS))
+    bank = Coverage.of(features, actions)
+    assert np.isfinite(bank.frame_distances).all()
+    _, percentile = bank.of_frames(bank.distances(features + 100, actions + 100))
+    assert (percentile == 1).all()  # far away
+
+
 def test_a_number_that_hardly_varies_is_not_amplified() -> None:
     features, actions = parts(2)
     actions[..., 0] = 0.5
@@ -95,6 +105,10 @@ def test_a_run_makes_its_bank_once(tmp_path: Path) -> None:
     again = make_coverage(trained, store, tmp_path)
     assert file.stat().st_mtime_ns == written
     np.testing.assert_array_equal(again.frames, made.frames)  # type: ignore[union-attr]
+    for damage in (Path.unlink, lambda path: path.write_bytes(b"cut")):
+        damage(file)
+        assert read_coverage(trained, store, tmp_path) is None
+        np.testing.assert_array_equal(make_coverage(trained, store, tmp_path).frames, made.frames)  # type: ignore[union-attr]
     other = replace(trained, params={**trained.params, "more": np.ones(1)})
     assert read_coverage(other, store, tmp_path) is None
 

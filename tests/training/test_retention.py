@@ -29,7 +29,7 @@ def test_kept_are_the_newest_the_multiples_and_the_best(
     for step in steps:
         newest = sum(other > step for other in steps) < keep_last
         multiple = keep_every > 0 and step % keep_every == 0
-        best = step in judged and all((judged[step], -step) <= (metric, -s) for s, metric in judged.items())
+        best = step in judged and all((judged[step], step) <= (metric, s) for s, metric in judged.items())
         assert kept[step] == (newest or multiple or best)
 
 

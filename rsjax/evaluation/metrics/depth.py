@@ -139,10 +139,13 @@ def _exact_scores(scene: Scene) -> dict[str, DepthScores]:
     if scene.truth.depth is None or not rows.any():
         raise Unavailable("no test clip has depth in metres")
     exact = scene.truth.depth[rows, scene.prompt_frames :]
-    scores = {"": depth_scores(exact, estimated.prediction[rows, scene.prompt_frames :], "none")}
+    videos = {"": estimated.prediction}
     if not estimated.baseline:
-        scores["_truth"] = depth_scores(exact, estimated.truth[rows, scene.prompt_frames :], "none")
-    return scores
+        videos["_truth"] = estimated.truth
+    try:
+        return {part: depth_scores(exact, each[rows, scene.prompt_frames :], "none") for part, each in videos.items()}
+    except ValueError as error:
+        raise Unavailable(str(error)) from error
 
 
 def _scores(scene: Scene, alignment: Alignment, source: DepthSource) -> DepthScores:

@@ -63,7 +63,7 @@ def record_start(run: Run, command: str) -> list[str]:
         "config": to_dict(run.config),
         "keys": run.keys(),
         "code": code_version(Path(rsjax.__file__).resolve().parents[1]),
-        "packages": dict(sorted((each.metadata["Name"], each.version) for each in importlib.metadata.distributions())),
+        "packages": packages(),
         "machine": machine(),
         "data": data_fingerprints(run),
     }
@@ -137,10 +137,18 @@ def code_version(root: Path) -> dict[str, Any]:
 
 def _git(root: Path, *arguments: str) -> str | None:
     try:
-        done = subprocess.run(["git", "-C", str(root), *arguments], capture_output=True, text=True, timeout=30)
+        done = subprocess.run(
+            ["git", "-C", str(root), *arguments], capture_output=True, text=True, errors="replace", timeout=30
+        )
     except (OSError, subprocess.TimeoutExpired):
         return None
     return done.stdout.strip() if done.returncode == 0 else None
+
+
+def packages() -> dict[str, str]:
+    """Returns the versions of the installed packages; without those that a broken installation left nameless."""
+    found = [(each.metadata["Name"], each.version) for each in importlib.metadata.distributions()]
+    return dict(sorted((name, version) for name, version in found if name))
 
 
 def training_settings(config: Config) -> dict[str, Any]:

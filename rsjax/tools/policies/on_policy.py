@@ -18,7 +18,7 @@ from rsjax.artifact import make_once
 from rsjax.config import SimConfig, content_key
 from rsjax.data.clips import first_clip
 from rsjax.data.codec import Record, decode, encode
-from rsjax.data.state_labels import knows_success
+from rsjax.data.state_labels import knows_success, provenance_within
 from rsjax.data.store import Store, complete_key, open_store, write_store
 from rsjax.errors import UserError
 from rsjax.files import write_file
@@ -164,13 +164,8 @@ def windows(record: Record, frames: int) -> list[Record]:
                 value = value[span].copy()
             clip[name] = value
         clip["actions"][0] = 0  # nothing led into the first frame
-        origin = dict(record["provenance"])
-        origin[WINDOW] = origin.get(WINDOW, 0) + first
-        if "objects" in origin:
-            places = dict(origin["objects"])
-            places |= {name: at[span] for name, at in places.items() if isinstance(at, list)}
-            origin["objects"] = places
-        clips.append(clip | {"provenance": origin})
+        origin = provenance_within(record["provenance"], span)
+        clips.append(clip | {"provenance": origin | {WINDOW: origin.get(WINDOW, 0) + first}})
     return clips
 
 

@@ -235,6 +235,14 @@ def _estimated(seed, **changes):
     return EstimatedDepth(truth, prediction, **{"metres": True, **changes})
 
 
+def _without_depth(clip):
+    """The true videos, of which a clip's sensor measured nothing."""
+    truth = _scene().truth
+    depth = truth.depth.copy()
+    depth[clip] = 0
+    return dataclasses.replace(truth, depth=depth)
+
+
 def test_estimated_depth_is_scored_against_exact_depth():
     estimated = _estimated(3)
     scene = _scene(estimated=estimated)
@@ -258,6 +266,7 @@ def test_estimated_depth_is_scored_against_exact_depth():
         ({"estimated": None}, "no estimator: --eval.depth-estimator simulator"),
         ({"estimated": _estimated(3, metres=False)}, "the estimator's depth is not in metres"),
         ({"estimated": _estimated(3), "truth": Video(_scene().truth.rgb)}, "no test clip has depth in metres"),
+        ({"estimated": _estimated(3), "truth": _without_depth(1)}, "true depth of video 1 has no pixel"),
     ],
 )
 def test_without_exact_depth_or_metres_there_is_a_reason(changes, reason):

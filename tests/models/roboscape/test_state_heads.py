@@ -219,4 +219,5 @@ def test_labels_of_a_record_are_nan_where_it_has_none() -> None:
     np.testing.assert_allclose(state_labels(simulated), [[0, 0.02, 0.08], [1, 0.1, 0.04]])
     older = simulated | {"provenance": {"objects": {"cube": [[0, 0]] * 2}}}
     np.testing.assert_array_equal(state_labels(older), [[0, np.nan, np.nan], [1, np.nan, np.nan]])
-    assert np.isnan(state_labels({"actions": actions, "provenance": {}})).all()
+    for other in ({}, {"objects": ["cup", "plate"]}, {"objects": {"height": [1.0], "opening": "wide"}}):
+        assert np.isnan(state_labels({"actions": actions, "provenance": other})).all()

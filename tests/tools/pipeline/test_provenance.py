@@ -138,10 +138,10 @@ def test_the_revision_is_the_checkouts_own_and_changes_of_it_show(tmp_path: Path
     clean = code_version(tmp_path)
     assert (clean["revision"], clean["dirty"], clean["diff_sha256"]) == (git("rev-parse", "HEAD"), False, None)
     hashes = set()
-    for text in ("2", "3"):
-        (tmp_path / "code.py").write_text(text)
+    for text in (b"2", b"3", b"caf\xe9"):  # the last in Latin-1
+        (tmp_path / "code.py").write_bytes(text)
         changed = code_version(tmp_path)
         assert changed["revision"] == clean["revision"] and changed["dirty"]
         hashes.add(changed["diff_sha256"])
-    assert len(hashes) == 2
+    assert len(hashes) == 3
     assert code_version(inside)["revision"] is None, "a package inside somebody's checkout is not that checkout"
