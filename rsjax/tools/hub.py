@@ -9,7 +9,7 @@ from rsjax.errors import UserError, first_line
 from rsjax.files import disk_guard, replace_directory
 from rsjax.model_directory import CARD, CLIPS, SETTINGS, TENSORS, check_digests, is_saved
 
-FILES = (SETTINGS, TENSORS, CARD, f"{CLIPS}/*")
+FILES = (SETTINGS, TENSORS, CARD, "metrics.json", f"{CLIPS}/*")
 
 
 class HubError(UserError):

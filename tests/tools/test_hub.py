@@ -140,11 +140,12 @@ def test_a_pushed_model_is_pulled_as_it_was_and_a_damaged_one_is_refused(
     mine = tmp_path / "mine"
     model.save(mine)
     (mine / "notes.txt").write_text("stays here")
+    (mine / "metrics.json").write_text("{}")  # as rsjax save writes it
     toy.store(mine / "clips")
     status, out = call(hub, tmp_path, "push", str(mine), "me/mine")
     assert (status, f"{hub.address}/me/mine/commit/{COMMIT}" in out) == (0, True), out
     files = hub.files["me/mine"]
-    assert {"README.md", "config.json", "model.safetensors", "clips/manifest.json"} <= files.keys()
+    assert {"README.md", "config.json", "model.safetensors", "metrics.json", "clips/manifest.json"} <= files.keys()
     assert "notes.txt" not in files
     copy = tmp_path / "copy"
     status, out = call(hub, tmp_path, "pull", "me/mine", str(copy))

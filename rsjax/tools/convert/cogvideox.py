@@ -384,6 +384,10 @@ def scheduler_settings(noise: NoiseConfig) -> dict[str, Any]:
         "prediction_type": predicted[noise.prediction],
         "snr_shift_scale": noise.snr_shift,
         "rescale_betas_zero_snr": noise.zero_terminal,
+        # Not settings here, but diffusers begins elsewhere without them.
+        "timestep_spacing": "trailing",
+        "clip_sample": False,
+        "set_alpha_to_one": True,
     }
 
 

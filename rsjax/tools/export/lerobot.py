@@ -33,6 +33,7 @@ from rsjax.tools.export.lerobot_files import (
     outcome_columns,
     video_rate,
 )
+from rsjax.tools.ingest.actions import ActionLayout, described_layout
 from rsjax.tools.ingest.formats.lerobot import EXPORTED, PROVENANCE
 
 LAYOUTS: dict[str, type[LayoutV30 | LayoutV21]] = {"v3.0": LayoutV30, "v2.1": LayoutV21}
@@ -152,6 +153,8 @@ def _write(store: Store, root: Path, options: LeRobotOptions, report: Callable[[
     splits = {}
     generated: list[int] = []
     cameras: dict[str, None] = {}
+    second = False
+    recordings: list[str] = []
     for name in names:
         if layout:
             begins = layout.episodes
@@ -178,6 +181,8 @@ def _write(store: Store, root: Path, options: LeRobotOptions, report: Callable[[
                     f"export them from stores of their own, or give --fps"
                 )
             cameras[_camera(clip)] = None
+            second |= "second" in clip
+            recordings.append(str(clip["provenance"].get("episode", layout.episodes)))
             if clip["provenance"].get("source") == GENERATED:
                 generated.append(layout.episodes)
             layout.add(LeRobotEpisode({layout.cameras[0]: clip["rgb"]}, columns, str(clip["task"])))
@@ -189,10 +194,28 @@ def _write(store: Store, root: Path, options: LeRobotOptions, report: Callable[[
     if generated:
         mark = {"generated_episodes": generated, "episodes": layout.episodes, "note": GENERATED_MARK}
         write_json(root / "meta" / PROVENANCE, mark)
+    if second:
+        note(f"{store.path}: the second view of its clips is left out")
     if len(cameras) > 1:
         note(f"{store.path}: has clips of the cameras {', '.join(cameras)}; all are in {layout.cameras[0]}")
-    write_json(root / "meta" / EXPORTED, {"store": str(store.manifest.get("key")), "split": options.split})
+    about: dict[str, Any] = {"store": str(store.manifest.get("key")), "split": options.split, "recordings": recordings}
+    meaning = actions_of(store, layout.features["action"]["shape"][0])
+    if meaning:
+        about["actions"] = meaning.to_json()
+    write_json(root / "meta" / EXPORTED, about)
     return layout.finish({"codebase_version": options.version, "robot_type": options.robot, "splits": splits})
+
+
+def actions_of(store: Store, width: int) -> ActionLayout | None:
+    """Returns what the ``width`` numbers of a store's actions mean; None if it does not say so."""
+    if names_controls(store, width):
+        return ActionLayout("delta", held=tuple(range(len(CONTROLS) - 1, width, len(CONTROLS))))
+    return described_layout(store.manifest.get("action_dimensions") or [])
+
+
+def names_controls(store: Store, width: int) -> bool:
+    """Returns whether an action is a few controls of the simulated Lift in a row."""
+    return store.manifest.get("source", "").startswith("robosuite/") and width % len(CONTROLS) == 0
 
 
 def _layout(store: Store, clip: Record, root: Path, options: LeRobotOptions) -> LayoutV30 | LayoutV21:
@@ -208,9 +231,8 @@ def _layout(store: Store, clip: Record, root: Path, options: LeRobotOptions) -> 
     fps = float(video_rate(fps))  # timestamps have to be those of the frames, even in a long video of many episodes
     width = clip["actions"].shape[1]
     names = [f"action_{number}" for number in range(width)]
-    steps = width // len(CONTROLS)
-    if store.manifest.get("source", "").startswith("robosuite/") and width == steps * len(CONTROLS):
-        names = [f"{name}_{step}" for step in range(steps) for name in CONTROLS]  # of simulated Lift
+    if names_controls(store, width):
+        names = [f"{name}_{step}" for step in range(width // len(CONTROLS)) for name in CONTROLS]
     columns: dict[str, Sequence[str]] = {}
     if options.state == "zeros":
         columns[STATE] = ZEROS

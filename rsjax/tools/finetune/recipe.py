@@ -147,11 +147,11 @@ def moving_share(store: Store) -> float:
 def reversible(store: Store) -> BackwardsConfig | None:
     """Returns how the store's clips run backwards; None if one of their actions is neither a step nor a state."""
     states = []
-    dimensions = store.manifest.get("action_dimensions") or []
-    for number, line in enumerate(dimensions):
-        if line.endswith(("(held)", "(absolute)")):
+    dimensions = meanings(store)
+    for number, (kind, *more) in enumerate(dimensions):
+        if kind in ("held", "absolute") and more in ([], ["of a quaternion"]):
             states.append(number)
-        elif not line.endswith("(delta)"):
+        elif (kind, *more) != ("delta",):
             return None
     if not dimensions:
         return None
@@ -160,8 +160,14 @@ def reversible(store: Store) -> BackwardsConfig | None:
 
 def of_targets(store: Store) -> bool:
     """Returns whether all actions of the store are targets or states, whose sum means nothing."""
-    dimensions = store.manifest.get("action_dimensions") or []
-    return bool(dimensions) and all(line.endswith(("(held)", "(absolute)")) for line in dimensions)
+    dimensions = meanings(store)
+    return bool(dimensions) and all(kind in ("held", "absolute") for kind, *_ in dimensions)
+
+
+def meanings(store: Store) -> list[list[str]]:
+    """Returns what a store says of each dimension of its actions: the kind, then such as "of a quaternion"."""
+    lines = store.manifest.get("action_dimensions") or []
+    return [line.rpartition("(")[2].removesuffix(")").split(", ") for line in lines]
 
 
 def finetuned(

@@ -251,6 +251,25 @@ def _product(left: Float64[np.ndarray, "*N 4"], right: Float64[np.ndarray, "*N 4
     return np.concatenate([vector, w_l * w_r - np.sum(vector_l * vector_r, -1, keepdims=True)], -1)
 
 
+def described_layout(lines: Sequence[str]) -> ActionLayout | None:
+    """Returns the layout of a store's actions from its lines of :func:`describe_dimensions`; None if there are none.
+
+    Rows that were stacked count as dimensions of their own.
+    """
+    kinds = [line.rpartition("(")[2].removesuffix(")").split(", ") for line in lines]
+    turned = [number for number, words in enumerate(kinds) if "of a quaternion" in words]
+    moving = {words[0] for words in kinds} - {"held"}
+    if not moving <= {"absolute", "delta"} or len(moving) > 1:
+        return None
+    held = tuple(number for number, words in enumerate(kinds) if words[0] == "held")
+    if not lines:
+        return None
+    kind: Kind = "absolute"
+    if "delta" in moving:
+        kind = "delta"
+    return ActionLayout(kind, tuple(turned[::4]), held)
+
+
 class Declared(NamedTuple):
     """The declarations of a data set or its user about actions, as arguments of :func:`layout_of`; None: nothing."""
 

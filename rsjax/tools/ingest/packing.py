@@ -56,18 +56,20 @@ def split_episodes(refs: Sequence[EpisodeRef], shares: SplitShares) -> dict[str,
     If the source is a store with train and other splits, its clips stay in train or go to test, since several clips can
     show the same recording; the share of test is then ignored. Otherwise a hash of the ids decides: of two or more
     episodes each split gets at least one, but ``test`` is empty if its share is 0. ``validation`` is taken from what
-    is not ``test``, and train keeps at least one.
+    is not ``test``, and train keeps at least one. Episodes that a source calls clips of one recording stay together.
     """
-    test = {ref.id for ref in refs if ref.location.get("split", "train") != "train"}
-    if not 0 < len(test) < len(refs):
-        test = choose_test([ref.id for ref in refs], shares.test, shares.seed)
-    rest = [ref.id for ref in refs if ref.id not in test]
+    recordings = {ref.id: str(ref.location.get("recording", ref.id)) for ref in refs}
+    names = list(dict.fromkeys(recordings.values()))
+    test = {recordings[ref.id] for ref in refs if ref.location.get("split", "train") != "train"}
+    if not 0 < len(test) < len(names):
+        test = choose_test(names, shares.test, shares.seed)
+    rest = [name for name in names if name not in test]
     chosen = {"test": test}
     if shares.validation:
-        chosen["validation"] = choose_test(rest, shares.validation * len(refs) / len(rest), shares.seed)
+        chosen["validation"] = choose_test(rest, shares.validation * len(names) / len(rest), shares.seed)
     others = set[str]().union(*chosen.values())
-    splits = {"train": [ref for ref in refs if ref.id not in others]}
-    return splits | {split: [ref for ref in refs if ref.id in ids] for split, ids in chosen.items()}
+    splits = {"train": [ref for ref in refs if recordings[ref.id] not in others]}
+    return splits | {split: [ref for ref in refs if recordings[ref.id] in some] for split, some in chosen.items()}
 
 
 def cut_episodes(plan: IngestPlan, refs: Sequence[EpisodeRef]) -> list[CutEpisode]:

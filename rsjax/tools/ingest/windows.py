@@ -19,6 +19,7 @@ from rsjax.config import require
 from rsjax.tools.ingest.episode import EpisodeError, Segment
 
 MAX_STEP = 2**20  # recorded frames from one frame of a window to the next
+DRIFT = 0.25  # recorded frames by which a window may end too late where the rate is lower than windows take
 _TIE = 1e-6  # share of a frame interval: two frames count as equally near up to this rounding error
 Span = tuple[int, int]  # first frame, and the one after the last
 
@@ -78,7 +79,8 @@ def check_rate(fps: float, config: WindowConfig) -> float:
         step = 1.0
     if not step < MAX_STEP:
         raise EpisodeError(f"fps: recorded at {fps:g} fps, which no camera does; mend the file's rate or times")
-    if step < 1 - 1e-6:
+    # A clock that jitters gives a rate a little off; over a window the frames stay those nearest to its steps.
+    if step < 1 - DRIFT / config.frames:
         message = f"fps: recorded at {fps:g} fps, windows take {config.rate:g}; lower windows.rate"
         raise EpisodeError(message, option="--windows.rate")
     return step

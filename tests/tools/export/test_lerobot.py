@@ -116,6 +116,31 @@ def test_ingested_again_the_clips_are_the_same(tmp_path: Path, version: Any) -> 
     assert marks[0] == marks[1]
 
 
+def test_what_actions_are_and_which_clips_are_of_one_recording_is_kept(tmp_path: Path) -> None:
+    off = dict.fromkeys(("shots", "motion", "depth", "tracks", "semantics"), "none")
+    windows = WindowConfig(frames=3, rate=0, hop=1)
+    first = IngestOptions(out=tmp_path / "clips", windows=windows, image_size=32, test_share=0.0, **off)  # type: ignore[arg-type]
+    export_lerobot(toy_store(tmp_path / "store", 8), tmp_path / "recorded", LeRobotOptions(crf=1))
+    (tmp_path / "recorded" / "meta" / "rsjax.json").unlink()  # somebody else's recordings, of deltas
+    declared = replace(first, option=("kind=delta", "held=[2]"))
+    ingest(make_plan("lerobot", tmp_path / "recorded", declared))
+    store = rsjax.open_store(tmp_path / "clips")
+    assert store.manifest["action_dimensions"] == ["action_0 (delta)", "action_1 (delta)", "action_2 (held)"]
+
+    export_lerobot(store, tmp_path / "out", LeRobotOptions(crf=1))
+    options = replace(first, out=tmp_path / "again", windows=replace(windows, hop=3), test_share=0.3)
+    ingest(make_plan("lerobot", tmp_path / "out", options))
+    again = rsjax.open_store(tmp_path / "again")
+    assert again.manifest["action_dimensions"] == store.manifest["action_dimensions"]
+    owner = [clip["provenance"]["episode"] for clip in records(store)]  # the export's episodes are these clips
+    split_of: dict[str, str] = {}
+    for split in ("train", "test"):
+        for clip in records(again, split):
+            recording = owner[int(clip["provenance"]["episode"].removeprefix("episode_"))]
+            assert split_of.setdefault(recording, split) == split
+    assert set(split_of.values()) == {"train", "test"}
+
+
 @pytest.mark.parametrize("version", ["v3.0", "v2.1"])
 def test_rows_say_what_their_action_led_to_where_the_store_knows(tmp_path: Path, version: Any) -> None:
     success = np.array([False, True, False, False, False, True])

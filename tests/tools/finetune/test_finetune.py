@@ -234,7 +234,7 @@ def test_targets_are_not_added_up(whole: Run, model: Path) -> None:
     adds = replace(own, departures=replace(own.departures, integrate_actions=True))
     source = replace(source, config=replace(source.config, model=adds))
     store = open_store(whole.clips)
-    for kind, added in {"delta": True, "absolute": False}.items():
+    for kind, added in {"delta": True, "absolute": False, "absolute, of a quaternion": False}.items():
         known = replace(store, manifest=store.manifest | {"action_dimensions": [f"x ({kind})", "grip (held)"]})
         config = finetuned(source, known, "", SETTINGS.for_clips(source.config, 2), adapts=True)
         assert isinstance(config.model, RoboScapeConfig)

@@ -120,6 +120,14 @@ def test_a_rate_above_the_recorded_one_is_refused() -> None:
         even_windows(5, [(0, 9)], WindowConfig(rate=10))
 
 
+@pytest.mark.parametrize("slower", [-0.005, 0.005, 0.01])
+def test_a_clock_that_is_a_little_off_is_of_its_rate(slower: float) -> None:
+    fps = 5.0 * (1 - slower)
+    windows = even_windows(fps, [(0, 60)], WindowConfig(frames=16, rate=5.0, hop=1)).frames
+    assert len(windows) >= 40 and (np.diff(windows, axis=1) >= 1).all()
+    assert np.ptp(windows, axis=1).tolist() == [15] * len(windows)
+
+
 @pytest.mark.parametrize("fps", [1e30, float("inf"), float("nan")])
 def test_a_rate_that_no_camera_has_is_refused(fps: float) -> None:
     with pytest.raises(EpisodeError, match=r"fps: recorded at .* which no camera does"):

@@ -190,7 +190,11 @@ class AgiBot:
         videos = self._root / "observations" / task / identity / "videos"
         files = [self._root / "proprio_stats" / task / identity / "proprio_stats.h5"]
         files += [videos / f"{name}_color.mp4" for name in self._cameras]
-        return EpisodeRef(safe_id(f"{task}-{identity}"), fingerprint(files, location), location)
+        made_of = fingerprint(files, location)
+        maps = self._root / "observations" / task / identity / "depth"
+        if maps.is_dir():
+            made_of = fingerprint([], made_of, sorted((path.name, path.stat().st_size) for path in maps.iterdir()))
+        return EpisodeRef(safe_id(f"{task}-{identity}"), made_of, location)
 
 
 class Proprio:

@@ -18,7 +18,7 @@ from jaxtyping import Float, UInt8
 
 from rsjax.clip import GENERATED, words_of
 from rsjax.files import safe_id
-from rsjax.tools.ingest.actions import Declared, Kind, align_actions, check_layout, flat_names, layout_of
+from rsjax.tools.ingest.actions import ActionLayout, Declared, Kind, align_actions, check_layout, flat_names, layout_of
 from rsjax.tools.ingest.episode import (
     FETCH_AGAIN,
     MAX_FPS,
@@ -93,7 +93,29 @@ def open_source(
     else:
         stay = tuple(held)
     declared = Declared(kind or (None if "delta" in names else "absolute"), stay, tuple(quaternions))
-    return LeRobot(path, info, tasks, declared, action, state, exported, generated)
+    recordings: tuple[str, ...] = ()
+    if exported:
+        recordings, meaning = _about(path / "meta" / EXPORTED)
+        if meaning and (kind, held, tuple(quaternions)) == (None, None, ()):
+            declared = meaning
+    return LeRobot(path, info, tasks, declared, action, state, exported, generated, recordings)
+
+
+def _about(path: Path) -> tuple[tuple[str, ...], Declared | None]:
+    """Returns of which recording each exported clip is, and what the actions are if the file says so."""
+    about = read_json(path)
+    try:
+        recordings = tuple(map(str, about.get("recordings") or ()))
+        if "actions" not in about:
+            return recordings, None
+        layout = ActionLayout.from_json(about["actions"])
+        if layout.kind not in ("absolute", "delta") or not all(
+            isinstance(number, int) for number in layout.held + layout.quaternions
+        ):
+            raise ValueError(f"actions are {about['actions']!r:.80}")
+    except (AttributeError, TypeError, ValueError) as error:
+        raise SourceError(f"{path}: field missing or wrong ({error}); export the store again") from error
+    return recordings, Declared(layout.kind, layout.held, layout.quaternions)
 
 
 @dataclass(frozen=True)
@@ -171,6 +193,7 @@ class LeRobot:
         state: str,
         exported: bool = False,
         generated: frozenset[int] = frozenset(),
+        recordings: tuple[str, ...] = (),
     ) -> None:
         self._root = root
         self._info = info
@@ -180,6 +203,8 @@ class LeRobot:
         self._state = state
         self._exported = exported  # by this project, which writes clips: each is one shot
         self._generated = generated
+        self._recordings = recordings  # which recording each clip is of
+        self._known = fingerprint((), sorted(tasks.items()))
 
     def episodes(self) -> Iterator[EpisodeRef]:
         """Lists ``meta/episodes``; a bad or repeated entry becomes a reference that cannot be read."""
@@ -300,8 +325,10 @@ class LeRobot:
             }
             for key in info.of_type("video")
         }
+        if number < len(self._recordings):
+            location["recording"] = self._recordings[number]
         paths = [location["data"], *(video["path"] for video in location["videos"].values())]
-        mark = fingerprint([inside(self._root, path) for path in paths], location, self._declared)
+        mark = fingerprint([inside(self._root, path) for path in paths], location, self._declared, self._known)
         return EpisodeRef(f"episode_{number:06d}", mark, location)
 
     def _check_rows(

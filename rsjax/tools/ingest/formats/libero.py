@@ -15,6 +15,7 @@ LIBERO = Convention(
     ("ee_states", "gripper_states", "joint_states"),
     after=True,
     stored="bottom first",
+    buffer=True,
     fps=20.0,
 )
 

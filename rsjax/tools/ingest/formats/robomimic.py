@@ -47,6 +47,7 @@ class Convention:
         quaternions: those of these keys that are a quaternion, whose sign is made continuous.
         after: whether ``obs[t]`` was recorded after ``actions[t]``.
         stored: as in :class:`rsjax.tools.ingest.formats.hdf5.H5Frames`.
+        buffer: whether depth maps are OpenGL's buffer, from 0 to 1, instead of metres.
         fps: frames per second if the file does not say.
     """
 
@@ -56,6 +57,7 @@ class Convention:
     quaternions: tuple[str, ...] = ()
     after: bool = False
     stored: Stored = "upright"
+    buffer: bool = False
     fps: float = 20.0
 
 
@@ -99,8 +101,10 @@ def open_demos(path: Path, convention: Convention, filter: str, depth: bool, siz
         try:
             demos = source.demos(file)
             with open_file(file) as content:
-                first = content[f"data/{demos[0]}"] if demos else None
-                if first is not None and not _picture_keys(first.get("obs", {}), convention):
+                first = member(content, f"data/{demos[0]}", file) if demos else None
+                if not isinstance(first, h5py.Group):
+                    continue  # refused when it is read
+                if not _picture_keys(_observed(first, file), convention):
                     try:
                         source.pictures(first, file)  # they may be rendered
                     except EpisodeError as error:
@@ -199,7 +203,7 @@ class DemoSource:
         Raises:
             EpisodeError: pictures have another shape or type, or a demo without pictures cannot be rendered.
         """
-        observed = group.get("obs", {})
+        observed = _observed(group, path)
         stored = self.convention.stored
         keys = _picture_keys(observed, self.convention)
         if not keys and self.size:
@@ -207,6 +211,10 @@ class DemoSource:
         if not keys:
             raise EpisodeError.at(path, f"{group.name}/obs has no *{self.convention.endings[0]}", CURE)
         maps = [f"{camera}_depth" for camera in keys if self.depth and f"{camera}_depth" in observed]
+        for key in maps:
+            if self.convention.buffer and observed[key].size and np.max(observed[key][0]) <= 1:
+                problem = f"{group.name}/obs/{key} is OpenGL's depth buffer, from 0 to 1, and not in metres"
+                raise EpisodeError.at(path, problem, "leave depth=true out, and estimate depth (--depth)")
         return (
             {camera: H5Frames(path, f"{observed.name}/{key}", stored) for camera, key in keys.items()},
             {key.removesuffix("_depth"): H5Frames(path, f"{observed.name}/{key}", stored, depth=True) for key in maps},
@@ -234,6 +242,14 @@ class DemoSource:
                 raise SourceError(f"{path}: no mask/{self.filter}{hint}; it has {', '.join(masks) or 'no filters'}")
             listed = masks[self.filter][()]
         return sorted((name.decode() if isinstance(name, bytes) else str(name) for name in listed), key=_number)
+
+
+def _observed(group: Any, path: Path) -> Any:
+    """Returns what a demo observed; raises :class:`EpisodeError` if that is no group."""
+    observed = group.get("obs", {})
+    if isinstance(observed, h5py.Dataset):
+        raise EpisodeError.at(path, f"{group.name}/obs is a data set, no group", LEAVE_OUT)
+    return observed
 
 
 def _picture_keys(observed: Any, how: Convention) -> dict[str, str]:

@@ -1,4 +1,5 @@
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -182,6 +183,19 @@ def test_incomplete_depth_is_left_out_and_noted(tmp_path: Path) -> None:
     assert not episode.depth
     assert episode.meta["notes"]["depth_left_out"] == "7 depth maps for 8 frames"
     assert read_first("agibot", root, cameras=["hand_left"]).depth == {}
+
+
+def test_depth_that_is_unpacked_later_makes_another_episode(tmp_path: Path) -> None:
+    root = write_agibot(tmp_path)
+
+    def mark() -> str:
+        return next(iter(open_source("agibot", root).episodes())).fingerprint
+
+    whole = mark()
+    shutil.move(root / f"observations/{TASK}/{EPISODE}/depth", tmp_path / "packed")
+    without = mark()
+    shutil.move(tmp_path / "packed", root / f"observations/{TASK}/{EPISODE}/depth")
+    assert whole == mark() != without
 
 
 def test_every_episode_is_listed_whether_or_not_it_is_whole(tmp_path: Path) -> None:

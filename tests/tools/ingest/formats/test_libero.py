@@ -1,7 +1,9 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
 
+from rsjax.tools.ingest.episode import EpisodeError
 from rsjax.tools.ingest.formats import open_source
 from tests.tools.ingest.formats.reading import read_first
 from tests.tools.ingest.formats.toy_demos import SIDE, demo, write_demos
@@ -21,6 +23,15 @@ def test_pictures_and_depth_are_flipped_upright_and_mirrored_only_if_asked(tmp_p
         picture = episode.cameras["agentview"].read([1])[0, ..., 0]
         assert np.argwhere(picture == 255).tolist() == [list(corner)]
         assert np.argwhere(episode.depth["agentview"].read([1])[0] == 3).tolist() == [list(corner)]
+
+
+def test_opengls_depth_buffer_is_not_taken_for_metres(tmp_path: Path) -> None:
+    maps = np.full((4, SIDE, SIDE, 1), 0.98, np.float32)
+    write_demos(tmp_path / "a_demo.hdf5", {"demo_0": libero_demo() | {"obs/agentview_depth": maps}})
+    with pytest.raises(EpisodeError) as raised:
+        read_first("libero", tmp_path, depth=True)
+    assert "data/demo_0/obs/agentview_depth is OpenGL's depth buffer, from 0 to 1" in str(raised.value)
+    assert not read_first("libero", tmp_path).depth
 
 
 def test_an_action_stands_with_the_frame_that_was_recorded_after_it(tmp_path: Path) -> None:

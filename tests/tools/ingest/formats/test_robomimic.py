@@ -1,6 +1,7 @@
 import pickle
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -58,6 +59,19 @@ def test_quaternions_of_the_state_keep_their_sign(tmp_path: Path) -> None:
     episode = read_first("robomimic", path)
     np.testing.assert_allclose(np.asarray(episode.states)[:, 3:7], [[0, 0.6, 0, 0.8]] * 4, atol=1e-6)
     assert episode.meta["notes"] == {"flipped": {"robot0_eef_quat": 2}}
+
+
+@pytest.mark.parametrize("place", ["data/demo_0", "data/demo_0/obs"])
+def test_data_in_place_of_a_group_are_refused_one_by_one(tmp_path: Path, place: str) -> None:
+    path = write_demos(tmp_path / "a.hdf5", {"demo_0": demo(), "demo_1": demo()})
+    with h5py.File(path, "a") as file:
+        del file[place]
+        file[place] = np.zeros(3)
+    source = open_source("robomimic", path)
+    bad, good = source.episodes()
+    assert len(source.read(good).timestamps) == 4
+    with pytest.raises(EpisodeError):
+        source.read(bad)
 
 
 def test_an_unreadable_file_among_others_is_one_entry(tmp_path: Path) -> None:
