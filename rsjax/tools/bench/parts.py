@@ -5,6 +5,7 @@ Each part takes a configuration, a batch size and a time budget per quantity, an
 """
 
 import dataclasses
+import math
 import tempfile
 import time
 from functools import partial
@@ -79,7 +80,9 @@ def train_adamw(config: Config, batch: int, budget: float) -> Numbers:
 def train(config: Config, batch: int, budget: float) -> Numbers:
     """Measures the world model's training step on one device, and its compilation without caches."""
     model = create_model(config)
-    loop = dataclasses.replace(config.loop("world_model"), batch_size=batch, sharding="jit")
+    loop = config.loop("world_model")
+    accumulate = math.gcd(loop.accumulate, batch)  # a smaller batch has fewer parts
+    loop = dataclasses.replace(loop, batch_size=batch, accumulate=accumulate, sharding="jit")
     state = jax.jit(lambda: create_state(model, loop))()
     clips = inputs.batch(model, config, batch)
     began = time.perf_counter()

@@ -76,7 +76,7 @@ class WorldClient:
         """Sends a message and returns the answer.
 
         Raises:
-            ServerError: the server cannot do it, or ends the connection.
+            ServerError: the server cannot do it, ends the connection, or answers too late, which ends it too.
         """
         try:
             self.socket.send(pack({"endpoint": endpoint} | fields))
@@ -110,7 +110,8 @@ class WorldClient:
         try:
             answer = self.socket.recv(self._timeout)
         except TimeoutError as error:
-            raise ServerError(f"no answer within {self._timeout:g} seconds") from error
+            self.close()  # else the late answer would be taken for that to the next request
+            raise ServerError(f"no answer within {self._timeout:g} seconds; connect again") from error
         except ConnectionClosed as error:
             raise ServerError(f"the server ended the connection: {error}") from error
         if isinstance(answer, str):

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from rsjax.errors import UserError, did_you_mean
+from rsjax.models.trained import as_array
 from rsjax.tools.play.messages import Refused, whole
 from rsjax.tools.policies.worlds.environments import WorldModelEnv
 from rsjax.tools.serve.wire import WireError
@@ -72,7 +73,7 @@ class ClientSession:
         The field "actions" is (T, A); row t leads into frame t, and row 0 is not read.
         """
         _check_names(fields, ("actions", *START))
-        rows = np.asarray(fields.pop("actions", None))
+        rows = as_array("actions", fields.pop("actions", None))
         if rows.ndim != 2 or not 2 <= len(rows) <= self._most:
             raise WireError(f"actions have shape {rows.shape}; expected (T, A) with T from 2 to {self._most}")
         env = self._make()

@@ -113,6 +113,11 @@ def test_a_part_alone_measures_that_part() -> None:
     assert not [name for name in measured if name.startswith(("train_", "sample_", "tokenizer_", "matmul_"))]
 
 
+def test_a_batch_of_one_clip_is_one_part() -> None:
+    config = with_values(toy(), {"train.accumulate": 2})
+    assert parts.train(config, batch=1, budget=0.0)["train_step_s"] > 0
+
+
 @pytest.mark.parametrize(("step_s", "batch_s", "share"), [(1.0, 3.0, 0.75), (2.0, 0.0, 0.0)])
 def test_the_share_of_waiting_is_that_of_a_slow_loader(
     step_s: float, batch_s: float, share: float, monkeypatch: pytest.MonkeyPatch

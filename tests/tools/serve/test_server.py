@@ -21,6 +21,7 @@ pytest.importorskip("websockets", reason="websockets is not installed (make setu
 from gymnasium.utils.env_checker import check_env
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
+from websockets.sync.server import serve
 from websockets.typing import Origin
 
 import rsjax.tools.policies  # noqa: F401 - registers
@@ -214,7 +215,8 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"endpoint": "reset", "rgb": "x", "clip": 1}, "not with both"),
     ({"endpoint": "generate", "actions": np.zeros((1, 28))}, "T from 2 to 9"),
     ({"endpoint": "generate", "actions": np.zeros((10, 28))}, "T from 2 to 9"),
-    ({"endpoint": "generate"}, "actions have shape ()"),
+    ({"endpoint": "generate", "actions": [[1.0], [1.0, 2.0]]}, "actions"),
+    ({"endpoint": "generate"}, "actions"),
 ]
 
 
@@ -393,6 +395,27 @@ def test_where_nobody_serves_the_client_says_what_to_do() -> None:
     with pytest.raises(UserError) as error:
         WorldClient(f"ws://127.0.0.1:{port}")
     assert "rsjax serve RUN starts one" in str(error.value)
+
+
+def test_an_answer_that_comes_too_late_is_not_taken_for_the_next() -> None:
+    asked = threading.Event()
+
+    def answer(socket: Any) -> None:
+        socket.send(pack({}))
+        for number, _ in enumerate(socket):
+            asked.wait(60)
+            socket.send(pack({"frame": number}))
+
+    with serve(answer, "127.0.0.1", 0) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        client = WorldClient(f"ws://127.0.0.1:{server.socket.getsockname()[1]}", timeout=0.05)
+        with pytest.raises(ServerError) as late:
+            client.step(np.zeros(28))
+        assert "no answer within 0.05 seconds; connect again" in str(late.value)
+        asked.set()
+        with pytest.raises(ServerError):
+            client.step(np.zeros(28))
+        server.shutdown()
 
 
 ADDRESSES: tuple[Any, ...] = ("", None, 5, "http://a", "x" * 5000, "ws://" + "x" * 5000, "ws://[::1")

@@ -30,7 +30,7 @@ state.transport = makeTransport({
     state.frame = frame;
     redraw();
   },
-  beyond: () => ready() && state.pace.step(),
+  beyond: () => ready() && !state.pace.flying() && state.pace.step(), // a held key repeats faster than frames come
   changed() {
     state.halted = false;
     if (ready()) state.pace.pump();

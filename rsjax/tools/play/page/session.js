@@ -16,8 +16,9 @@ export async function loadLink(otherwise) {
 async function begin(type, fields) {
   state.transport.pause();
   state.incoming = [];
-  const message = await attempt(state.connection.call(type, fields));
-  const came = state.incoming;
+  const call = state.connection.call(type, fields);
+  const message = await attempt(call);
+  const came = state.incoming.filter(({ id }) => id === call.id); // not of a step in the session before
   state.incoming = null;
   if (!message) return false;
   state.session = null;
@@ -25,7 +26,7 @@ async function begin(type, fields) {
   askAgain();
   [state.current, state.beside] = [0, null];
   applySession(message);
-  came.forEach((take) => take());
+  came.forEach(tree.putFrame);
   const { length } = tree.branches.get(state.current);
   state.transport.resize(length, length - 1);
   return true;
@@ -57,12 +58,12 @@ function startText({ start: from, task, clip_frames: frames }) {
 
 /** Takes a frame that came. */
 export function takeFrame(got) {
+  const key = got.kind === "rgb" ? state.pace.arrived(got.id) : undefined;
   if (state.incoming) {
-    state.incoming.push(() => tree.putFrame(got));
+    state.incoming.push(got);
     return;
   }
   tree.putFrame(got);
-  const key = got.kind === "rgb" ? state.pace.arrived(got.id) : undefined;
   if (key === undefined) {
     redraw();
     return;
@@ -77,9 +78,9 @@ export function takeFrame(got) {
 
 /** Takes the PSNR or the points of a frame. */
 export function takeFacts(message) {
-  const put = () => (message.type === "truth" ? tree.putScore(message) : tree.putPoints(message));
-  if (state.incoming) state.incoming.push(put);
-  else put();
+  if (state.incoming) return; // of the session before; the new one is asked again
+  if (message.type === "truth") tree.putScore(message);
+  else tree.putPoints(message);
   redraw();
 }
 

@@ -23,8 +23,8 @@ export function makeStarts({ start, upload, note }) {
     const { clips, total, message } = await answer.json();
     if (!answer.ok) throw new Error(message);
     list.append(...clips.map(card));
-    shown += clips.length;
-    more.hidden = shown >= total || !clips.length;
+    shown += PAGE; // damaged clips are left out
+    more.hidden = shown >= total;
   }
 
   function card({ clip, task, frames, success }) {

@@ -152,14 +152,15 @@ def _label(name: str) -> str:
     return "\n".join(textwrap.wrap(name, LABEL, max_lines=2, placeholder="…"))
 
 
-def _lines(comparison: Comparison, metric: Metric) -> list[tuple[str, np.ndarray, np.ndarray]]:
+def _lines(comparison: Comparison, metric: Metric) -> list[tuple[int, np.ndarray, np.ndarray]]:
+    """Returns frames and values of each entry that has this metric, with the entry's number."""
     lines = []
-    for entry in comparison.entries:
+    for number, entry in enumerate(comparison.entries):
         curves: list[Curves] = [result.curves for result in entry.group.results]
         name = entry.score(metric)
         if all(name in each for each in curves):
             points = np.mean([np.array(each[name], float) for each in curves], axis=0)
-            lines.append((entry.name, np.array(curves[0][metric.axis], float), points))
+            lines.append((number, np.array(curves[0][metric.axis], float), points))
     return lines
 
 
@@ -167,8 +168,9 @@ def _chart(comparison: Comparison, metric: Metric) -> Chart:
     """Draws a metric over the predicted frames; a line is the mean over an entry's seeds."""
 
     def draw(axes: Axes) -> None:
-        for number, (label, frames, points) in enumerate(_lines(comparison, metric)):
-            color = COLORS[number % len(COLORS)]
+        for number, frames, points in _lines(comparison, metric):
+            color = COLORS[number % len(COLORS)]  # an entry has one colour in all charts
+            label = comparison.entries[number].name
             marker = "o" if len(frames) == 1 else None
             axes.plot(frames, points, color=color, marker=marker, linewidth=1.3, label=label)
         axes.set_title(metric.heading, fontsize=9, loc="left")

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from rsjax.config import SimConfig
 from rsjax.tools.pipeline.run import Run
 from rsjax.tools.studies.paper import budget
 from rsjax.tools.studies.paper.claim import Claim
@@ -45,7 +46,7 @@ class ArmScores:
         planned: the number of trainings that it was meant to have.
         seeds: those of finished trainings.
         trainings: the names of the finished trainings' directories, which end with a content key.
-        clips: the content key of each finished training's clips; they differ if the seed decides the clips too.
+        clips: a key of each finished training's test clips; they differ if the seed decides the clips too.
         numbers: by metric or name in ``Claim.beside``, the score of each finished seed over all clips; None without.
         scores: by measurement ("" for the run's own evaluation) and by name, the clips' scores.
         parameters: trained and frozen ones, in words.
@@ -100,7 +101,6 @@ def read_arm(claim: Claim, name: str, plan: Plan, known: Mapping[str, RunResult]
     cells = plan.of(claim.name, name)
     results = tuple(known[cell.name] for cell in cells)
     finished = [result for result in results if result.state == "finished"]
-    keys = [result.run.keys() for result in finished]
     # Scores over all clips: of the claim's metrics, of baselines, and those shown beside them.
     compared = dict.fromkeys([*(each.metric for each in claim.comparisons), *claim.shown])
     baselines = [f"{metric}{suffix}" for metric in compared for suffix in BASELINES]
@@ -122,7 +122,7 @@ def read_arm(claim: Claim, name: str, plan: Plan, known: Mapping[str, RunResult]
         planned=len(cells),
         seeds=tuple(result.run.config.train.seed for result in finished),
         trainings=tuple(result.name for result in finished),
-        clips=tuple(key["collect"] for key in keys),
+        clips=tuple(key_of_test_clips(result.run) for result in finished),
         numbers={metric: values for metric, values in numbers.items() if any(value is not None for value in values)},
         scores=scores,
         absent=plan.absent.get((claim.name, name), ""),
@@ -142,6 +142,12 @@ def read_arm(claim: Claim, name: str, plan: Plan, known: Mapping[str, RunResult]
         tflop=round(sum(budget.training_cost(config, "flops")) / 1e12, 1),
         minutes=round(sum(seconds) / len(seconds) / 60, 1),
     )
+
+
+def key_of_test_clips(run: Run) -> str:
+    """Returns a key of a run's test clips, which are the expert's and the same whatever recipe the others follow."""
+    config = run.config
+    return replace(run, config=replace(config, sim=replace(config.sim, recipe=SimConfig().recipe))).keys()["collect"]
 
 
 def merge_arms(one: ArmScores, other: ArmScores) -> ArmScores:

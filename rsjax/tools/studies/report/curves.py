@@ -43,7 +43,7 @@ def charts_svg(charts: Sequence[Chart], name: str, legend: bool = False, height:
     Args:
         charts: each draws into the axes that it gets; ``INK`` becomes the text colour.
         name: says what is drawn, and makes the element ids of several drawings on a page distinct.
-        legend: draw one legend with the first chart's labels above all charts.
+        legend: draw one legend with the charts' labels above them.
         height: the height of a row, in units in which the whole width is 11.6.
     """
     rows = math.ceil(len(charts) / _COLUMNS)
@@ -64,8 +64,12 @@ def charts_svg(charts: Sequence[Chart], name: str, legend: bool = False, height:
             axes.grid(alpha=0.18, linewidth=0.6, color=INK)
             draw(axes)
         if legend:
-            handles, labels = figure.axes[0].get_legend_handles_labels()
-            figure.legend(handles, labels, loc="outside upper left", ncols=len(labels), frameon=False)
+            handles: dict[str, Any] = {}
+            for axes in figure.axes:
+                for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+                    handles.setdefault(label, handle)
+            columns = len(handles)
+            figure.legend(handles.values(), handles, loc="outside upper left", ncols=columns, frameon=False)
         buffer = io.StringIO()
         figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
     svg = buffer.getvalue()

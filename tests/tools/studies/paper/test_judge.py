@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from rsjax.config import presets
+from rsjax.tools.pipeline.run import Run
 from rsjax.tools.studies import result_pages
 from rsjax.tools.studies.paper import result_files
-from rsjax.tools.studies.paper.arm_scores import ArmScores, ScoreRows, rounded
+from rsjax.tools.studies.paper.arm_scores import ArmScores, ScoreRows, key_of_test_clips, rounded
 from rsjax.tools.studies.paper.claim import ArmComparison
 from rsjax.tools.studies.paper.claim_tables import claim_content, claim_tables
 from rsjax.tools.studies.paper.judge import Outcome, judge_claim
@@ -87,6 +89,14 @@ def test_seeds_of_one_arm_alone_have_no_pair() -> None:
     apart = {"with_": arm("with", 0.5, clips=OWN[:2]), "without": arm("without", clips=OWN[2:])}
     (found,) = outcome(ArmComparison("psnr", "with", "without"), **apart).judged
     assert found.difference is None and "no clip has a score" in found.reason
+
+
+def test_runs_on_clips_of_two_recipes_have_the_same_test_clips() -> None:
+    config = presets.get("tiny")
+    mixed = replace(config, sim=replace(config.sim, recipe=("expert=0.5", "grasps=0.5")))
+    other = replace(config, sim=replace(config.sim, seed=1))
+    keys = [key_of_test_clips(Run(each, Path("run"), Path("data"))) for each in (config, mixed, other)]
+    assert keys[0] == keys[1] != keys[2]
 
 
 def test_a_difference_that_holds_alone_may_not_among_several() -> None:
