@@ -119,7 +119,13 @@ class Config:
         if self.model.uses_tokenizer and self.autoencoder is self.tokenizer:
             self.tokenizer.grid(clips.image_size)
         self.model.check(clips)
-        shortened = max((stage.frames for stage in self.train.curriculum), default=0)
+        lengths = [stage.frames for stage in self.train.curriculum if stage.frames]
+        shortened = max(lengths, default=0)
+        require(
+            min(lengths, default=clips.frames) > self.prompt_frames,
+            f"a stage of train.curriculum takes {min(lengths, default=0)} frames of a clip, of which the first "
+            f"{self.prompt_frames} are given (prompt_frames); it needs one more to predict",
+        )
         require(
             shortened <= clips.frames and (not shortened or isinstance(self.model, TokenModelConfig)),
             f"a stage of train.curriculum takes {shortened} of {clips.frames} frames of a clip, and only families of "
@@ -158,7 +164,9 @@ class Config:
     def one_start(self) -> bool:
         """Whether all training clips begin where an episode does, with the robot in one place, as far as is known."""
         components = [each for stage in self.train.curriculum for each in stage.components]
-        return self.data is None and self.sim.one_start and not any(each.store for each in components)
+        backwards = isinstance(self.model, TokenModelConfig) and self.model.backwards is not None
+        own = self.data is None and not any(each.store for each in components)
+        return own and self.sim.one_start and not backwards
 
     @property
     def autoencoder(self) -> Any:

@@ -31,6 +31,7 @@ class BackwardsConfig:
     """
 
     share: float = 0.5  # of the clips that are drawn
+    # Only for actions of one step each: those of several in a row (sim.control_steps) do not lead back.
     # Dimensions of an action that are states, such as a gripper's opening; the others are steps, whose sign changes.
     held: tuple[int, ...] = ()
 
@@ -240,6 +241,7 @@ class LossConfig:
     num_keypoints: int = 32  # K of the top-K, at most all tracks; the paper does not give its K
 
     def __post_init__(self) -> None:
+        require_range(self, "model.loss", 0, math.inf, "depth_weight", "keypoint_weight", "attention_weight", "gamma")
         require(self.num_keypoints >= 1, f"model.loss.num_keypoints is {self.num_keypoints}; it must be at least 1")
 
 
@@ -360,6 +362,11 @@ class TokenModelConfig(TransformerConfig, ModelConfig):
             f"it to 0 (as many as the clips have)",
         )
         check_sampling(self.sample, self.frames(clips), self.departures.action_dropout)
+        held = self.backwards.held if self.backwards else ()
+        require(
+            all(0 <= number < clips.action_dim for number in held),
+            f"model.backwards.held is {held}, but actions have the dimensions 0 to {clips.action_dim - 1}",
+        )
 
 
 @dataclass(frozen=True)

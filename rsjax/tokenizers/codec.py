@@ -99,7 +99,8 @@ class Codec:
 
     def _colors(self, depth: Float[np.ndarray, "*B H W"]) -> UInt8[np.ndarray, "*B H W 3"]:
         near_far = self.normalization.require_depth_range()
-        return depth_to_color(depth, *near_far, self.config.depth_scale).astype(np.uint8)
+        known = np.nan_to_num(depth, nan=0.0)  # NaN and 0 both say that it is unknown
+        return depth_to_color(known, *near_far, self.config.depth_scale).astype(np.uint8)
 
     def _chunked(self, method: Literal["encode", "decode"], images: np.ndarray) -> np.ndarray:
         axes = 3  # of pixels, or of codes

@@ -165,7 +165,7 @@ def test_a_stored_value_of_another_type_is_refused_by_name(path: str, value: Any
         ("train.optimizer", {"learning_rate": math.inf}, "train.optimizer.learning_rate is inf; it must be a finite"),
         ("train.optimizer", {"learning_rate": -1e-3}, "optimizer.learning_rate is -0.001; it must be at least 0"),
         ("train.optimizer", {"betas": (0.9, 1.5)}, "optimizer.betas are (0.9, 1.5); they are two numbers"),
-        ("model.loss", {"depth_weight": math.nan}, "model.loss.depth_weight is nan; it must be a finite"),
+        ("model.loss", {"depth_weight": math.nan}, "model.loss.depth_weight is nan; it must be at least 0"),
         ("model.corruption", {"probability": -math.inf}, "model.corruption.probability is -inf; it must be 0 … 1"),
         ("train", {"ema": math.nan}, "train.ema is nan; it must be 0 … 1"),
         ("runtime", {"max_damaged": 2.0}, "runtime.max_damaged is 2.0; it must be 0 … 1"),

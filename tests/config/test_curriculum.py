@@ -47,6 +47,14 @@ def read(*argv: str) -> Config:
     return parse(argv, "train", "", NoOptions())[0]
 
 
+def test_a_stage_has_a_frame_to_predict() -> None:
+    config = dataclasses.replace(presets.get("debug"), prompt_frames=4)
+    stages = (CurriculumStageConfig(frames=5), CurriculumStageConfig(frames=4))
+    with pytest.raises(ConfigError) as raised:
+        dataclasses.replace(config, train=dataclasses.replace(config.train, curriculum=stages))
+    assert "takes 4 frames of a clip, of which the first 4 are given (prompt_frames)" in str(raised.value)
+
+
 @pytest.mark.parametrize(("preset", "frames"), [("debug", 100), ("irasim_tiny", 4)])
 def test_frames_that_clips_or_families_do_not_have_are_refused(preset: str, frames: int) -> None:
     config = presets.get(preset)

@@ -43,6 +43,7 @@ def test_a_frame_does_not_change_the_frames_before_it() -> None:
         ("cells", (1, 16, 256, 3, 1, 24)),  # head width
         ("frames", (1, 12, 256, 3, 1, 16)),
         ("frames", (1, 16, 2, 3, 1, 16)),  # fewer cells than a tile
+        ("frames", (1, 1, 64, 3, 1, 16)),  # a tile of one frame attends over its cells
     ],
 )
 def test_other_shapes_do_not_fit(over: Over, shape: tuple[int, ...]) -> None:

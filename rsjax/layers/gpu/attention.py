@@ -38,14 +38,14 @@ def fits(shape: tuple[int, ...], over: Over) -> bool:
     """Returns whether :func:`attend` takes a qkv of this shape (B, T, S, 3, h, e).
 
     Head widths are 16, 32, 64 or, over frames, 128. Over cells, S is a power of two from 16 to 256. Over frames, T is a
-    power of two up to 64, and S is divisible by the 64/T neighbouring cells of a tile.
+    power of two from 2 to 64, and S is divisible by the 64/T neighbouring cells of a tile.
     """
     _, frames, cells, _, _, width = shape
     if width not in HEAD_WIDTHS:
         return False
     if over == "cells":
         return cells in (16, 32, 64, 128, 256) and width <= 64
-    return frames in (1, 2, 4, 8, 16, 32, 64) and cells % (ROWS // frames) == 0
+    return frames in (2, 4, 8, 16, 32, 64) and cells % (ROWS // frames) == 0
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(1, 2))

@@ -136,6 +136,8 @@ class CogVideoXConfig(ModelConfig):
     def __post_init__(self) -> None:
         sizes = ("width", "blocks", "heads", "mlp_ratio", "patch_size", "time_width", "unroll")
         require_range(self, "model", 1, math.inf, *sizes)
+        require_range(self, "model", 0, math.inf, "error_weight")
+        require(bool(self.loss_weights), "model.error_weight is 0, the only term: nothing would be learned; raise it")
         require(self.position_scale > 0, f"model.position_scale is {self.position_scale}; it must be above 0")
         require(
             0 <= self.image_dropout < 1,

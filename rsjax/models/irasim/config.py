@@ -124,6 +124,8 @@ class IRASimConfig(DiTConfig, ModelConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        require_range(self, "model", 0, math.inf, "error_weight", "depth_weight")
+        require(bool(self.loss_weights), "model.error_weight is 0, the only term: nothing would be learned; raise it")
         require(
             0 <= self.action_dropout < 1,
             f"model.action_dropout is {self.action_dropout}; it is a share of the clips, at least 0 and below 1",
