@@ -107,13 +107,20 @@ def number_text(value: float | None, form: str) -> str:
     return format(value, form)
 
 
-def mean_text(spread: Spread | None, decimals: int) -> str:
-    """Returns ``mean ± sample deviation``, the mean alone for a single value, or "–" for None."""
+def mean_text(spread: Spread | None, decimals: int, seeds: int = 0) -> str:
+    """Returns ``mean ± sample deviation``, the mean alone for a single value, or "–" for None.
+
+    Args:
+        seeds: how many seeds there are; if some lack the score, the text says how many have it. 0: unknown.
+    """
     if spread is None:
         return ABSENT
-    if spread.std is None:
-        return f"{spread.mean:.{decimals}f}"
-    return f"{spread.mean:.{decimals}f} ± {spread.std:.{decimals}f}"
+    text = f"{spread.mean:.{decimals}f}"
+    if spread.std is not None:
+        text += f" ± {spread.std:.{decimals}f}"
+    if seeds and spread.n < seeds:
+        text += f" ({spread.n} seeds)"
+    return text
 
 
 def p_text(p: float) -> str:

@@ -10,7 +10,6 @@ from rsjax.tools.studies.ablation.figure import draw
 from rsjax.tools.studies.paper.arm_scores import BASELINES, CEILING, ArmScores
 from rsjax.tools.studies.paper.judge import Judged, Outcome
 from rsjax.tools.studies.report.score_charts import PLACE_SCENES
-from rsjax.tools.studies.results import Spread
 from rsjax.tools.studies.tables import ABSENT, CellText, Marked, Table, mean_text, number_text, p_text
 
 LEGEND = (
@@ -153,7 +152,7 @@ def _arm(arm: ArmScores, outcome: Outcome, columns: Sequence[Metric]) -> dict[st
         "absent": arm.absent,
         "seeds": f"{len(arm.seeds)} of {arm.planned}",
         "failed": sum(result.state == "failed" for result in arm.results),
-        "scores": [_score_text(spreads.get(c.name), c.decimals, len(arm.seeds)) for c in columns],
+        "scores": [mean_text(spreads.get(c.name), c.decimals, len(arm.seeds)) for c in columns],
         "published": [number_text(published.get(c.name), f".{c.decimals}f") for c in _published_columns(outcome)],
         "values": {name: spread._asdict() for name, spread in spreads.items()},
         "beside": [number_text(means.get(name), ".3g") for name in beside],
@@ -163,14 +162,6 @@ def _arm(arm: ArmScores, outcome: Outcome, columns: Sequence[Metric]) -> dict[st
         "minutes": arm.minutes,
         "runs": [str(result.run.directory) for result in arm.results],
     }
-
-
-def _score_text(scores: Spread | None, decimals: int, seeds: int) -> str:
-    """Returns the mean over the seeds, with their number if some lack the score."""
-    text = mean_text(scores, decimals)
-    if scores is None or scores.n == seeds:
-        return text
-    return f"{text} ({scores.n} seeds)"
 
 
 def _baselines(outcome: Outcome, columns: Sequence[Metric]) -> list[dict[str, Any]]:
