@@ -17,7 +17,8 @@ NARROW = replace(WIDE, feature_dtype="bfloat16")
 
 
 def test_logits_and_gradients_are_those_of_float32_to_rounding() -> None:
-    params = random_params(WIDE)
+    # At their full size, attention is so sharp that rounding decides the gradients on some processors.
+    params = jax.tree.map(lambda x: 0.5 * x, random_params(WIDE))
     arguments = random_inputs(WIDE)
 
     def loss(arch: Any, params: Any) -> Any:
@@ -26,11 +27,11 @@ def test_logits_and_gradients_are_those_of_float32_to_rounding() -> None:
 
     values = [jax.jit(jax.value_and_grad(partial(loss, arch)))(params) for arch in (WIDE, NARROW)]
     (expected, gradients), (found, other_gradients) = values
-    np.testing.assert_allclose(found, expected, rtol=0.05)
+    np.testing.assert_allclose(found, expected, rtol=0.02)
     assert found != expected
     for x, y in zip(jax.tree.leaves(other_gradients), jax.tree.leaves(gradients), strict=True):
         assert x.dtype == jnp.float32
-        np.testing.assert_allclose(x, y, atol=0.1 * float(jnp.max(jnp.abs(y))) + 1e-6)
+        np.testing.assert_allclose(x, y, atol=0.05 * float(jnp.max(jnp.abs(y))) + 1e-6)
 
 
 def test_a_program_for_a_cpu_keeps_features_in_float32() -> None:
