@@ -89,7 +89,7 @@ class DepthNetwork:
 
 def initial(size: int, first: float = 0.0) -> Params:
     """Returns the parameters before training, for square frames of ``size`` pixels per side."""
-    return dict(DepthUNet(first).init(jax.random.key(0), jnp.zeros((1, size, size, 3))))
+    return dict(jax.jit(DepthUNet(first).init)(jax.random.key(0), jnp.zeros((1, size, size, 3))))
 
 
 def train_depth_network(clips: Sequence[Record], steps: int) -> DepthNetwork:

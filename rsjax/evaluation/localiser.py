@@ -122,7 +122,7 @@ def train_localiser(clips: Sequence[Record], steps: int) -> Localiser:
     xy = recorded[0].xy.reshape(-1, 2, 2)
     lifted = recorded[0].lifted.reshape(-1)
 
-    params = LocaliserNetwork().init(jax.random.key(0), frames[:1])
+    params = jax.jit(LocaliserNetwork().init)(jax.random.key(0), frames[:1])
     optimizer = optax.adam(optax.cosine_decay_schedule(3e-3, steps))
     state = optimizer.init(params)
     rng = np.random.default_rng(0)

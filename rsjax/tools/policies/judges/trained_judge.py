@@ -213,7 +213,8 @@ def train_judge(footage: Footage, validation: Footage, steps: int, seed: int = 0
         )
     rng = np.random.default_rng(seed)
     height = footage.rgb.shape[2]
-    params = JudgeNetwork().init(jax.random.key(seed), np.zeros((1, HISTORY, height, height, 3), np.uint8))["params"]
+    videos = np.zeros((1, HISTORY, height, height, 3), np.uint8)
+    params = jax.jit(JudgeNetwork().init)(jax.random.key(seed), videos)["params"]
     optimizer = optax.adam(optax.cosine_decay_schedule(2e-3, steps))
     state = optimizer.init(params)
 
