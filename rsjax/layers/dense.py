@@ -89,7 +89,7 @@ def normalised(x: Float[Array, "*N C"], norm: Norm) -> Float[Array, "*N C"]:
 
 
 def rounded(params: Params, biases: tuple[str, ...] = ()) -> Params:
-    """Rounds the kernels of linear layers to bf16, as they do themselves in every pass.
+    """Rounds the kernels of linear layers to bf16, as they do themselves in every pass but on CPUs without bf16 units.
 
     Args:
         biases: names of layers whose biases are rounded too, as :func:`rsjax.layers.accelerator.linear` does for bf16

@@ -68,6 +68,7 @@ def test_both_products_have_the_same_values_gradients_and_number_formats(dtype: 
         np.testing.assert_allclose(x.astype(jnp.float32), y.astype(jnp.float32), rtol=0.01, atol=0.01)
 
 
+@pytest.mark.usefixtures("bf16_units")
 def test_weights_that_are_rounded_once_give_what_layers_that_round_them_give() -> None:
     x = numbers(5, 8).astype(jnp.bfloat16)
     layer = Dense(4, bf16=True)

@@ -43,7 +43,7 @@ def charts_svg(charts: Sequence[Chart], name: str, legend: bool = False, height:
     Args:
         charts: each draws into the axes that it gets; ``INK`` becomes the text colour.
         name: says what is drawn, and makes the element ids of several drawings on a page distinct.
-        legend: draw one legend with the charts' labels above them.
+        legend: draw one legend above the charts, with the labels of those that have none of their own.
         height: the height of a row, in units in which the whole width is 11.6.
     """
     rows = math.ceil(len(charts) / _COLUMNS)
@@ -65,7 +65,7 @@ def charts_svg(charts: Sequence[Chart], name: str, legend: bool = False, height:
             draw(axes)
         if legend:
             handles: dict[str, Any] = {}
-            for axes in figure.axes:
+            for axes in filter(lambda axes: axes.get_legend() is None, figure.axes):
                 for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
                     handles.setdefault(label, handle)
             columns = len(handles)
