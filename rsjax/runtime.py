@@ -83,6 +83,24 @@ def keep_compiled_programs() -> None:
     compilation_cache.reset_cache()  # jax looks for its directory at the first program, which may have run
 
 
+def drop_compiled_programs(most: int) -> bool:
+    """Drops the compiled programs that jax keeps if the process has more than ``most`` pieces of mapped memory.
+
+    A program takes several pieces. Linux gives a process 65,530, and at the next one XLA ends it. Off Linux, where
+    nothing counts them, programs are always dropped. Those in the cache on disk stay.
+
+    Returns:
+        Whether it dropped them.
+    """
+    with suppress(OSError):
+        if Path("/proc/self/maps").read_bytes().count(b"\n") <= most:
+            return False
+    import jax
+
+    jax.clear_caches()
+    return True
+
+
 def _cache_directory() -> Path | None:
     """Returns the directory of compiled programs; None if the user has no home directory.
 

@@ -10,13 +10,12 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from importlib.metadata import version
-from pathlib import Path
 from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, settings
 
-from rsjax.runtime import collect_rarely, set_xla_flags
+from rsjax.runtime import collect_rarely, drop_compiled_programs, set_xla_flags
 
 # The tests compile thousands of small programs and run each a few times, so most of their time is compilation. Without
 # LLVM's optimisations, compilation takes half the time; without the fusion emitters, which produce more code, it takes
@@ -78,8 +77,7 @@ settings.load_profile("any-speed")
 LONGEST = ("models", "reliability", "tools/pipeline", "tools/studies", "training", "tools/policies")
 
 
-# Linux maps 65,530 pieces of memory into a process, of which a compiled program takes several; XLA ends it at the next.
-MOST_PIECES = 30_000
+PIECES_OF_PROGRAMS = 20_000  # of mapped memory, about 5 GB
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -89,12 +87,8 @@ def earlier_objects() -> None:
     robosuite collects whenever it closes a simulator, and with those objects this takes seconds each time. Programs go
     before there are too many.
     """
-    pieces = Path("/proc/self/maps")
-    if pieces.exists() and pieces.read_bytes().count(b"\n") > MOST_PIECES:
-        import jax  # here, as its settings come first
-
+    if drop_compiled_programs(PIECES_OF_PROGRAMS):
         gc.unfreeze()
-        jax.clear_caches()
     gc.collect()
     gc.freeze()
 

@@ -3,6 +3,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
 import pytest
 
 from rsjax import runtime
@@ -127,3 +128,12 @@ def test_the_libraries_of_products_and_convolutions_are_chosen_unless_the_user_d
     monkeypatch.setenv("XLA_FLAGS", before)
     set_xla_flags()
     assert os.environ["XLA_FLAGS"] == after
+
+
+def test_programs_are_dropped_from_a_process_that_maps_too_much_memory() -> None:
+    double = jax.jit(lambda x: 2 * x)
+    double(1.0)
+    assert not runtime.drop_compiled_programs(most=10**9)
+    assert double._cache_size() == 1  # type: ignore[attr-defined]
+    assert runtime.drop_compiled_programs(most=0)
+    assert double._cache_size() == 0  # type: ignore[attr-defined]

@@ -147,8 +147,8 @@ def _git(root: Path, *arguments: str) -> str | None:
 
 def packages() -> dict[str, str]:
     """Returns the versions of the installed packages; without those that a broken installation left nameless."""
-    found = [(each.metadata["Name"], each.version) for each in importlib.metadata.distributions()]
-    return dict(sorted((name, version) for name, version in found if name))
+    found = [each.metadata for each in importlib.metadata.distributions()]  # read once, since this takes a second
+    return dict(sorted((each["Name"], each["Version"]) for each in found if each["Name"]))
 
 
 def training_settings(config: Config) -> dict[str, Any]:

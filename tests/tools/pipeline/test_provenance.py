@@ -63,7 +63,7 @@ def test_what_may_change_results_is_reported_at_the_next_start_and_not_after(
     if name == "code":
         monkeypatch.setattr(provenance, "code_version", lambda root: value)
     else:
-        older = [type("Distribution", (), {"metadata": {"Name": k}, "version": v})() for k, v in value.items()]
+        older = [type("Distribution", (), {"metadata": {"Name": k, "Version": v}})() for k, v in value.items()]
         monkeypatch.setattr(provenance.importlib.metadata, "distributions", lambda: older)
     assert record_start(run, "train") == [name]
     assert record_start(run, "train") == []

@@ -15,13 +15,12 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
-import jax
-
 from rsjax.config import require
 from rsjax.data.token_sets import OWN
 from rsjax.errors import UserError
 from rsjax.files import FileError, disk_guard, holder, lock, write_atomically, write_json
 from rsjax.progress import note, stage
+from rsjax.runtime import drop_compiled_programs
 from rsjax.tools.pipeline import stages
 from rsjax.tools.pipeline.run import Run, link
 from rsjax.tools.studies.ablation.figure import draw
@@ -29,6 +28,7 @@ from rsjax.tools.studies.ablation.grid import FILE, Choice, Grid, add_cells, mer
 from rsjax.tools.studies.ablation.table import Row, as_csv, as_json, as_markdown, shown_columns, tabulate
 from rsjax.tools.studies.results import ERROR, State, read_metrics, read_run
 
+PIECES_OF_PROGRAMS = 10_000  # of mapped memory, about 2 GB; a cell's programs take some thousands
 SHARED = ("tokenizer", "tokens", "world_model")  # each stage needs the stages before it
 
 
@@ -106,7 +106,8 @@ def run_cell(name: str, runs: Mapping[str, Run], shared: Path, place: tuple[int,
                 write_json(failure, record)
             return "failed"
         finally:
-            jax.clear_caches()  # no other cell uses this cell's compiled programs, which would accumulate
+            # Cells that differ in their seeds alone run the same programs, those of other cells accumulate.
+            drop_compiled_programs(PIECES_OF_PROGRAMS)
         return "finished"
 
 
