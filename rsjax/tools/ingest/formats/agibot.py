@@ -12,6 +12,7 @@ Axes: N frames, M ≤ N commands, D dimensions.
 
 import fnmatch
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -192,7 +193,7 @@ class AgiBot:
         files += [videos / f"{name}_color.mp4" for name in self._cameras]
         made_of = fingerprint(files, location)
         maps = self._root / "observations" / task / identity / "depth"
-        if maps.is_dir():
+        with suppress(OSError):  # without maps; those that may not be read are named when the episode is read
             made_of = fingerprint([], made_of, sorted((path.name, path.stat().st_size) for path in maps.iterdir()))
         return EpisodeRef(safe_id(f"{task}-{identity}"), made_of, location)
 
