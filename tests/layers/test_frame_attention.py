@@ -76,7 +76,7 @@ def test_a_model_of_large_frames_learns_as_with_plain_attention(
     )
     tokens = {name: jax.random.randint(jax.random.key(3), (1, 2, 3, 3), 0, 16) for name in ("rgb", "depth")}
     mask, actions = jnp.zeros((1, 2, 3, 3), bool), jnp.ones((1, 2, 3))
-    params = Transformer(cfg).init_params(jax.random.key(4))
+    params = jax.jit(Transformer(cfg).init_params)(jax.random.key(4))
 
     def loss(params: Any) -> jax.Array:
         logits, _ = Transformer(cfg).apply({"params": params}, tokens, mask, actions)  # type: ignore[misc]

@@ -71,13 +71,13 @@ def noisy(fresh: Any) -> Any:
 
 @pytest.fixture(scope="module")
 def params() -> Any:
-    return noisy(Transformer(TOY).init_params(jax.random.key(0)))
+    return noisy(jax.jit(Transformer(TOY).init_params)(jax.random.key(0)))
 
 
 @pytest.mark.parametrize("action_inputs", [0, 5])
 def test_logits_are_those_of_the_rgb_branch(action_inputs: int) -> None:
     arch = dataclasses.replace(TOY, action_inputs=action_inputs, action_encoder="mlp" if action_inputs else "none")
-    params = noisy(Transformer(arch).init_params(jax.random.key(0)))
+    params = noisy(jax.jit(Transformer(arch).init_params)(jax.random.key(0)))
     rng = np.random.default_rng(0)
     tokens, mask = rng.integers(0, 256, (2, 3, 4, 4)), rng.random((2, 3, 4, 4)) < 0.4
     actions = rng.normal(size=(2, 3, 5)).astype(np.float32)
@@ -96,7 +96,7 @@ def test_the_tokenizer_is_magvit2(changes: dict[str, Any]) -> None:
     config = TokenizerConfig(
         channels=8, channel_multipliers=(1, 2), res_blocks=1, norm_groups=4, code_bits=6, **changes
     )
-    drawn = noisy(Tokenizer(config).init_params(jax.random.key(0)))
+    drawn = noisy(jax.jit(Tokenizer(config).init_params)(jax.random.key(0)))
     encoder = MagvitEncoderTorch(config)
     decoder = MagvitDecoderTorch(config)
     tensors = {name: torch.tensor(np.ascontiguousarray(x)) for name, x in to_tensors(drawn, name_table(config)).items()}

@@ -53,7 +53,7 @@ def test_each_quantity_is_read_from_the_cells_that_its_query_finds() -> None:
     np.testing.assert_allclose(state_heads.outputs(params, features), y, rtol=1e-4, atol=1e-5)
     read = np.concatenate([sigmoid(y[..., :1]), 0.1 * y[..., 1:]], axis=-1)
     np.testing.assert_allclose(state_heads.readings(params, features), read, rtol=1e-4, atol=1e-5)
-    fresh = Transformer(HEADS).init_params(KEY)["state_heads"]
+    fresh = jax.jit(Transformer(HEADS).init_params)(KEY)["state_heads"]
     mean = layer_norm(features, fresh["norm"]).mean(2)
     linear = mean @ fresh["out"]["kernel"] + fresh["out"]["bias"]
     np.testing.assert_allclose(state_heads.outputs({"state_heads": fresh}, features), linear, rtol=1e-4, atol=1e-5)

@@ -80,7 +80,7 @@ def test_weights_without_actions_start_a_model_with_actions_that_changes_nothing
     model = IVideoGPT(LLAMA, CLIPS)
     shapes = model.pretrained_shapes(tmp_path / "own")
     saved = load_weights(tmp_path / "own" / "world_model" / "weights", shapes)
-    started = model.start(model.init(jax.random.key(0)), saved, tmp_path / "own")
+    started = model.start(jax.jit(model.init)(jax.random.key(0)), saved, tmp_path / "own")
     tokens = np.arange(20)[None]
     actions = np.ones((1, 3, 3), np.float32)
     mine, _ = LLaMA(model.architecture).apply({"params": started}, tokens, actions)

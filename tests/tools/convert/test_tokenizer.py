@@ -96,7 +96,7 @@ def test_a_training_checkpoint_yields_the_chosen_weights_and_counts_the_rest(gen
 
 def test_a_tokenizer_with_local_codes_comes_back() -> None:
     config = TokenizerConfig(4, 32, (1, 2), 1, local_codes=True)
-    params = jax.tree.map(np.asarray, Tokenizer(config).init_params(jax.random.key(0)))
+    params = jax.tree.map(np.asarray, jax.jit(Tokenizer(config).init_params)(jax.random.key(0)))
     written = to_tensors(params, name_table(config))
     inferred, read, _ = from_public("file", written)
     assert inferred == config

@@ -115,7 +115,7 @@ def test_keypoints_are_where_the_mass_is() -> None:
 
 def test_the_loss_is_the_error_of_the_drawn_noise() -> None:
     net = model()
-    params = net.init(jax.random.key(0))
+    params = jax.jit(net.init)(jax.random.key(0))
     rng, key = np.random.default_rng(0), jax.random.key(5)
     frames = rng.integers(0, 256, (3, 2, net.cropped, net.cropped, 3), np.uint8)
     batch: Any = {

@@ -46,8 +46,8 @@ def test_runs_in_which_no_policy_can_act_are_named_before_any_training(tmp_path:
 def test_a_judge_of_frames_of_another_size_is_named(tmp_path: Path) -> None:
     first = run(tmp_path / "first", presets.debug())
     for side in (60, 64):  # networks with parameters of equal shapes
-        params = JudgeNetwork().init(jax.random.key(0), np.zeros((1, HISTORY, side, side, 3), np.uint8))["params"]
-        TrainedJudge(params, 1.0, side).save(tmp_path / f"judge-{side}")
+        variables = jax.jit(JudgeNetwork().init)(jax.random.key(0), np.zeros((1, HISTORY, side, side, 3), np.uint8))
+        TrainedJudge(variables["params"], 1.0, side).save(tmp_path / f"judge-{side}")
     first.judge(tmp_path / "judge-64")
     with pytest.raises(
         UserError, match=r"judge-60/judge.msgpack: was trained on frames of 60 × 60 pixels, these have 64 × 64"

@@ -178,7 +178,7 @@ def test_a_runs_judge_is_made_and_saved(tmp_path: Path, monkeypatch: pytest.Monk
         return Video(prompt.rgb.repeat(actions.shape[1], 1))
 
     judge = TrainedJudge(
-        JudgeNetwork().init(jax.random.key(0), np.zeros((1, HISTORY, 64, 64, 3), np.uint8))["params"], 2.0, 64
+        jax.jit(JudgeNetwork().init)(jax.random.key(0), np.zeros((1, HISTORY, 64, 64, 3), np.uint8))["params"], 2.0, 64
     )
     run, store = tmp_path / "run", toy.store(tmp_path / "clips")
     model = SimpleNamespace(generate=generate, reconstruct=lambda assets, video: video)

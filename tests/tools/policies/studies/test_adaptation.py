@@ -45,7 +45,7 @@ class Place:
 def place(debug: Path, command: Commands, tmp_path_factory: pytest.TempPathFactory) -> Place:
     folder = tmp_path_factory.mktemp("adapt")
     run = shutil.copytree(debug, folder / "run", symlinks=True)
-    params = JudgeNetwork().init(jax.random.key(0), np.zeros((1, HISTORY, 64, 64, 3), np.uint8))["params"]
+    params = jax.jit(JudgeNetwork().init)(jax.random.key(0), np.zeros((1, HISTORY, 64, 64, 3), np.uint8))["params"]
     TrainedJudge(params, 1.0, 64).save(run / FOLDER)
     config = toy()
     demos = RunData(run, command.data).demos("all")
