@@ -77,7 +77,7 @@ settings.load_profile("any-speed")
 LONGEST = ("models", "reliability", "tools/pipeline", "tools/studies", "training", "tools/policies")
 
 
-PIECES_OF_PROGRAMS = 20_000  # of mapped memory, about 5 GB
+PIECES_OF_PROGRAMS = 30_000  # of mapped memory, about 6 GB
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -14,6 +14,7 @@ For public weights that stay frozen, the stage has no steps: ``tokenizer_train.s
 ``tokenizer_train.steps`` is 0. Resuming, logging, replaying, validation, describe and bench need no further code.
 """
 
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
@@ -78,6 +79,7 @@ class Autoencoder(Trainable[B], Protocol[B]):
         """Returns the trained codec with these :meth:`tokenizer_params`."""
         ...
 
+    @lru_cache(maxsize=8)  # noqa: B019 - an autoencoder is a value; tracing a large one takes seconds
     def shapes(self) -> Params:
         """Returns the shapes of :meth:`tokenizer_params`, without allocating them."""
         return jax.eval_shape(lambda: self.tokenizer_params(self.init(jax.random.key(0))))

@@ -10,11 +10,17 @@ from typing import Any, TypeAlias
 import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 Chart: TypeAlias = Callable[[Axes], None]
 
+# Inches. Places are fixed, since to find them by the sizes of all labels would take longer than to draw.
+_WIDTH = 11.6
 _COLUMNS = 4
+_LEFT = 0.6  # from here on: around the axes of a chart, for tick labels and titles
+_RIGHT = 0.12
+_BOTTOM = 0.4
+_TOP = 0.4
+_LEGEND = 0.3
 INK = "#010203"  # placeholder for the page's text colour
 LINE = "#3b7dd8"
 
@@ -47,6 +53,8 @@ def charts_svg(charts: Sequence[Chart], name: str, legend: bool = False, height:
         height: the height of a row, in units in which the whole width is 11.6.
     """
     rows = math.ceil(len(charts) / _COLUMNS)
+    width = _WIDTH / _COLUMNS
+    whole = height * rows + _LEGEND * legend
     settings: dict[Any, Any] = {
         "svg.fonttype": "none",
         "svg.hashsalt": name,
@@ -58,9 +66,12 @@ def charts_svg(charts: Sequence[Chart], name: str, legend: bool = False, height:
     }
     settings |= dict.fromkeys(["text.color", "axes.edgecolor", "axes.labelcolor", "xtick.color", "ytick.color"], INK)
     with matplotlib.rc_context(settings):
-        figure = Figure(figsize=(11.6, height * rows + 0.3 * legend), layout=ConstrainedLayoutEngine(h_pad=0.09))
-        for place, draw in enumerate(charts, start=1):
-            axes = figure.add_subplot(rows, _COLUMNS, place)
+        figure = Figure(figsize=(_WIDTH, whole))
+        for place, draw in enumerate(charts):
+            row, column = divmod(place, _COLUMNS)
+            left = (column * width + _LEFT) / _WIDTH
+            bottom = ((rows - 1 - row) * height + _BOTTOM) / whole
+            axes = figure.add_axes((left, bottom, (width - _LEFT - _RIGHT) / _WIDTH, (height - _BOTTOM - _TOP) / whole))
             axes.grid(alpha=0.18, linewidth=0.6, color=INK)
             draw(axes)
         if legend:
@@ -69,7 +80,7 @@ def charts_svg(charts: Sequence[Chart], name: str, legend: bool = False, height:
                 for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
                     handles.setdefault(label, handle)
             columns = len(handles)
-            figure.legend(handles.values(), handles, loc="outside upper left", ncols=columns, frameon=False)
+            figure.legend(handles.values(), handles, loc="upper left", ncols=columns, frameon=False)
         buffer = io.StringIO()
         figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
     svg = buffer.getvalue()
