@@ -4,7 +4,6 @@
 """
 
 import numpy as np
-from scipy.stats import rankdata
 
 from rsjax.evaluation.metrics.psnr import per_frame
 from rsjax.evaluation.registry import Scene, Score, Scores, Unavailable, metric
@@ -19,6 +18,8 @@ def coverage(scene: Scene) -> Scores:
     ``_error_correlation`` is Spearman's correlation, over the clips, of the distance with the loss of PSNR: 1 if the
     order of distances is that of errors. It is missing where one of them does not vary.
     """
+    from scipy.stats import rankdata  # not at the start, as it takes a second or two
+
     if scene.familiarity is None:
         raise Unavailable("no bank of training clips was made, or this family of models has no features")
     far = scene.familiarity.coverage

@@ -24,7 +24,6 @@ from rsjax.tools.pipeline.limits import check_batch, check_episodes
 from rsjax.tools.pipeline.metric_files import check_metric_files
 from rsjax.tools.pipeline.provenance import record_data, record_start
 from rsjax.tools.pipeline.run import TRAINED, Run, link
-from rsjax.tools.pipeline.summary import write_summary
 from rsjax.tools.pipeline.validation import TokenizerValidation, WorldModelValidation
 from rsjax.tools.sim.collect import collect
 from rsjax.trainable import Params
@@ -61,6 +60,8 @@ def run_all(run: Run, resume: bool = True, command: str = "") -> None:
     if _begins(run, "evaluation", "evaluating on the test split"):
         _do(run, "evaluation", evaluate)
     if _begins(run, "report", "writing the report"):
+        from rsjax.tools.pipeline.summary import write_summary  # not at the start, as matplotlib takes a second
+
         _do(run, "report", write_summary, command)
 
 
