@@ -18,11 +18,13 @@ from benchmarks.soak.runs import Soak, step_seconds
 from rsjax.data.quarantine import NAME as QUARANTINE
 from rsjax.data.store import open_store
 
+LEAST_STEPS = 60  # a shorter run of some milliseconds a step mostly ends before it is killed
+
 
 def try_bad_record(soak: Soak, show: Callable[[str], None]) -> dict[str, Any]:
     """Damages a record in a copy of the reference's tokens, and trains on it twice: left alone, and killed once.
 
-    Both runs have just enough steps to read every record once.
+    Both runs have enough steps to read every record once.
 
     Returns:
         As JSON: the number of the damaged ``record`` in the training split, the numbers that training ``quarantined``,
@@ -67,7 +69,7 @@ def try_bad_record(soak: Soak, show: Callable[[str], None]) -> dict[str, Any]:
 
 def _target(soak: Soak, run: Path, interval: float) -> Target:
     records = len(open_store(run / "tokens" / "store").source("train"))
-    steps = math.ceil(records / soak.config.train.batch_size) + 1
+    steps = max(LEAST_STEPS, math.ceil(records / soak.config.train.batch_size) + 1)
     few = () if soak.config.train.curriculum else ("--train.steps", str(steps))
     every = ("--runtime.log-every", "1", "--runtime.checkpoint-every", str(max(1, steps // 4)))
     command = soak.command(run, soak.options.data_dir, *few, *every)
