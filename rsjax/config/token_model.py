@@ -27,11 +27,11 @@ class CorruptionConfig:
 class BackwardsConfig:
     """Lets training clips run backwards, with the actions that lead back.
 
-    :mod:`rsjax.models.roboscape.departures.backwards` says how.
+    :mod:`rsjax.models.roboscape.departures.backwards` says how. It is only for actions of one step each: those of
+    several in a row (``sim.control_steps``) do not lead back.
     """
 
     share: float = 0.5  # of the clips that are drawn
-    # Only for actions of one step each: those of several in a row (sim.control_steps) do not lead back.
     # Dimensions of an action that are states, such as a gripper's opening; the others are steps, whose sign changes.
     held: tuple[int, ...] = ()
 

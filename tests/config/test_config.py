@@ -102,6 +102,7 @@ def test_clips_of_another_store_and_those_that_begin_midway_may_begin_anywhere()
     mixed = c.CurriculumStageConfig((c.ComponentConfig(), c.ComponentConfig(store="other-clips")))
     assert not with_values(BASE, {"train.curriculum": (mixed,)}).one_start
     assert not with_values(BASE, {"sim.recipe": ("expert", "midway")}).one_start
+    assert not with_values(BASE, {"model.backwards": "on"}).one_start
     assert not Architecture.create(with_values(BASE, {"train.curriculum": (mixed,)})).one_start
 
 

@@ -24,6 +24,7 @@ from rsjax.evaluation.metrics.psnr_motion import moved
 from rsjax.models.base import create_autoencoder
 from rsjax.tools.convert import directory as converted
 from rsjax.tools.finetune.start import StartingModel
+from rsjax.tools.ingest.actions import described_kinds
 from rsjax.tools.pipeline.run_clips import on_store
 from rsjax.tools.pipeline.validation import held_out
 
@@ -147,7 +148,7 @@ def moving_share(store: Store) -> float:
 def reversible(store: Store) -> BackwardsConfig | None:
     """Returns how the store's clips run backwards; None if one of their actions is neither a step nor a state."""
     states = []
-    dimensions = meanings(store)
+    dimensions = described_kinds(store.manifest.get("action_dimensions") or [])
     for number, (kind, *more) in enumerate(dimensions):
         if kind in ("held", "absolute") and more in ([], ["of a quaternion"]):
             states.append(number)
@@ -160,14 +161,8 @@ def reversible(store: Store) -> BackwardsConfig | None:
 
 def of_targets(store: Store) -> bool:
     """Returns whether all actions of the store are targets or states, whose sum means nothing."""
-    dimensions = meanings(store)
+    dimensions = described_kinds(store.manifest.get("action_dimensions") or [])
     return bool(dimensions) and all(kind in ("held", "absolute") for kind, *_ in dimensions)
-
-
-def meanings(store: Store) -> list[list[str]]:
-    """Returns what a store says of each dimension of its actions: the kind, then such as "of a quaternion"."""
-    lines = store.manifest.get("action_dimensions") or []
-    return [line.rpartition("(")[2].removesuffix(")").split(", ") for line in lines]
 
 
 def finetuned(

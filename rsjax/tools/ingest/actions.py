@@ -256,18 +256,23 @@ def described_layout(lines: Sequence[str]) -> ActionLayout | None:
 
     Rows that were stacked count as dimensions of their own.
     """
-    kinds = [line.rpartition("(")[2].removesuffix(")").split(", ") for line in lines]
+    if not lines:
+        return None
+    kinds = described_kinds(lines)
     turned = [number for number, words in enumerate(kinds) if "of a quaternion" in words]
     moving = {words[0] for words in kinds} - {"held"}
     if not moving <= {"absolute", "delta"} or len(moving) > 1:
         return None
     held = tuple(number for number, words in enumerate(kinds) if words[0] == "held")
-    if not lines:
-        return None
     kind: Kind = "absolute"
     if "delta" in moving:
         kind = "delta"
     return ActionLayout(kind, tuple(turned[::4]), held)
+
+
+def described_kinds(lines: Sequence[str]) -> list[list[str]]:
+    """Returns what each line of :func:`describe_dimensions` says: the kind, and more such as "of a quaternion"."""
+    return [line.rpartition("(")[2].removesuffix(")").split(", ") for line in lines]
 
 
 class Declared(NamedTuple):

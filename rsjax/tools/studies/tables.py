@@ -119,7 +119,7 @@ def mean_text(spread: Spread | None, decimals: int, seeds: int = 0) -> str:
     if spread.std is not None:
         text += f" ± {spread.std:.{decimals}f}"
     if seeds and spread.n < seeds:
-        text += f" ({spread.n} seeds)"
+        text += f" ({spread.n} of {seeds} seeds)"
     return text
 
 

@@ -25,6 +25,8 @@ def test_html_escapes_texts_and_has_a_class_for_each_mark() -> None:
 def test_numbers_are_texts_with_the_decimals_of_their_metric() -> None:
     assert mean_text(spread([1.0, 2.0]), 2) == "1.50 ± 0.71"
     assert mean_text(spread([1.0]), 1) == "1.0"
+    assert mean_text(spread([1.0]), 1, 1) == "1.0"
+    assert mean_text(spread([1.0]), 1, 3) == "1.0 (1 of 3 seeds)"
     assert interval_text(Estimate(1.0, 0.5, 1.5), 1) == "[0.5, 1.5]"
     assert interval_text(Estimate(1.0, None, None), 1) == interval_text(None, 1) == ""
     assert as_csv(["x", "y"], [[0.1, None]]) == "x,y\n0.1,\n"
