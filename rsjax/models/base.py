@@ -5,7 +5,7 @@ A family consists of a subclass of :class:`rsjax.config.ModelConfig` (its settin
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
@@ -214,14 +214,15 @@ class WorldModel(Trainable[B], Protocol[B]):
             prompt: one clip's first P frames.
             actions: as for :meth:`generate`.
             depth: as for :meth:`generate`.
-            last: return only this many frames, the last ones; a family need not decode the others.
+            last: return only this many frames, the last ones; a family need not decode the others. What state heads
+                read is of all generated frames.
             past: the actions that led from the beginning of the clip into the prompt's first frame, if that is a later
                 one; a family need not read them.
         """
         repeated = prompt[np.zeros(len(actions), int)]
         alike = np.zeros(len(actions), int)
         video = self.generate(params, assets, repeated, actions, index=alike, depth=depth)
-        return video if last is None else video.frames(-last)
+        return video if last is None else replace(video.frames(-last), state=video.state)
 
     def imagine(self, params: Params, assets: Assets, clips: int, depth: bool = True) -> Imagination:
         """Returns clips that are generated frame by frame; they equal those that :meth:`generate` makes at once.

@@ -220,7 +220,7 @@ class RoboScape(WorldModel[Batch]):
         key = jax.random.key(sample.seed)
         made = rollout_from(arch, sample, params, encoded, inputs[:, seen:], key, same_draws)
         if last is not None:
-            made = {branch: grid[:, -last:] for branch, grid in made.items()}
+            made = {name: grid if name == "state" else grid[:, -last:] for name, grid in made.items()}
         return self._video(assets, made, np.repeat(has_depth & depth, candidates), prompt, tokens)
 
     def imagine(self, params: Params, assets: Assets, clips: int, depth: bool = True) -> TokenImagination:

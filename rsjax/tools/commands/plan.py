@@ -28,7 +28,7 @@ class Options:
     policy: Path | None = None
     """A policy of rsjax policy_learning to compare with as well."""
     warm_start: bool = False
-    """Also plan with the policy's plans among the candidates."""
+    """Also plan with the policy's own rollouts in the world model among the candidates."""
     episodes: int = 50
     """Episodes for each way to act, with equal starts."""
     max_steps: int = 20

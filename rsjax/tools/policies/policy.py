@@ -50,17 +50,22 @@ class Policy:
         """Returns an actor for new episodes; the seed determines its draws."""
         return Actor(self, seed)
 
-    def plans(self, frames: UInt8[np.ndarray, "T S S 3"], count: int, seed: int) -> Float32[np.ndarray, "N F A"]:
-        """Returns several plans for the frames that follow, each with its own draws: an action for each frame.
+    @property
+    def executed_frames(self) -> int:
+        """Frames after which the policy makes a new plan."""
+        return self.model.config.execute // self.model.controls
+
+    def plans(self, frames: UInt8[np.ndarray, "B T S S 3"], seed: int) -> Float32[np.ndarray, "B F A"]:
+        """Returns a plan for the frames that follow each video, with its own draws: an action for each frame.
 
         Args:
             frames: those so far; the first is repeated if the policy observes more.
         """
         model = self.model
-        observed = np.maximum(np.arange(len(frames) - model.config.observations, len(frames)), 0)
-        alike = np.repeat(frames[None, observed], count, axis=0)
-        plan = _plan(without_training(model), self.params, alike, jax.random.key(seed))
-        return self.range.unscale(np.asarray(plan)).reshape(count, -1, self.action_dim)
+        length = frames.shape[1]
+        observed = np.maximum(np.arange(length - model.config.observations, length), 0)
+        plan = _plan(without_training(model), self.params, frames[:, observed], jax.random.key(seed))
+        return self.range.unscale(np.asarray(plan)).reshape(len(frames), -1, self.action_dim)
 
     def save(self, directory: Path) -> None:
         """Writes what :func:`load_policy` reads; ``policy.json`` comes last, so a policy that has one is complete."""
@@ -124,7 +129,7 @@ class Actor:
             )
         observed = model.config.observations
         self._seen = [*(self._seen or [frames] * (observed - 1)), frames][-observed:]
-        place = self._done % (model.config.execute // model.controls)
+        place = self._done % self._policy.executed_frames
         if place == 0:
             key = jax.random.fold_in(self._key, self._done)
             plan = _plan(model, self._policy.params, np.stack(self._seen, 1), key)

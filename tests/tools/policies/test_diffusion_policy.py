@@ -306,11 +306,12 @@ def test_demos_that_succeed_are_chosen(tmp_path: Path, capsys: pytest.CaptureFix
 def test_plans_are_what_an_actor_would_do_next(policy: tuple[Policy, Path]) -> None:
     made, _ = policy
     frames = np.stack([picture(place) for place in (1, 3)])
-    plans = made.plans(frames[-1:], 3, seed=0)
+    videos = frames[None, -1:].repeat(3, axis=0)
+    plans = made.plans(videos, seed=0)
     config = made.model.config
     assert plans.shape == (3, config.horizon // CONTROLS, CONTROLS * WIDTH)
     assert not np.array_equal(plans[0], plans[1])
-    np.testing.assert_array_equal(plans, made.plans(np.repeat(frames[-1:], config.observations, 0), 3, seed=0))
+    np.testing.assert_array_equal(plans, made.plans(videos.repeat(config.observations, axis=1), seed=0))
     low, high = np.array(made.range.low), np.array(made.range.high)
     controls = plans.reshape(-1, WIDTH)
     assert ((controls >= low - 1e-6) & (controls <= high + 1e-6)).all()

@@ -5,7 +5,6 @@ of the scripted expert's episode from the same start; the planner does not see h
 """
 
 import time
-import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
@@ -38,6 +37,7 @@ from rsjax.tools.policies.planning.energies import (
     token_distance,
 )
 from rsjax.tools.policies.planning.planner import Energy, Planner, PlannerConfig
+from rsjax.tools.policies.planning.proposals import policy_rollouts
 from rsjax.tools.policies.policy import Policy
 from rsjax.tools.policies.studies.trials import FPS
 from rsjax.tools.policies.worlds.actions import check_takes_actions
@@ -67,7 +67,7 @@ class PlanSettings:
         lpips_weights: a file of weights for "lpips".
         episodes: number of episodes, with seeds from ``FIRST_SEED`` on.
         max_steps: steps of an episode, at most.
-        warm_start: whether each method also plans with a policy's plans among its candidates, for every policy.
+        warm_start: whether each method also plans with a policy's rollouts among its candidates, for every policy.
     """
 
     planner: PlannerConfig = field(default_factory=PlannerConfig)
@@ -167,7 +167,7 @@ def actors(
         def make(seed: int, goal: np.ndarray) -> Actor:
             propose = None
             if policy is not None:
-                propose = partial(_proposals, policy, search.candidates // 2, seed)
+                propose = partial(policy_rollouts, trained, policy, search.candidates // 2, search.horizon, seed)
             planner = Planner(energy_of(trained, run, settings, goal), -high, high, search, propose)
             return PlanningActor(planner, len(high), depth)
 
@@ -184,11 +184,6 @@ def actors(
         if settings.warm_start:
             ways |= {f"{method} from {name}": planning(method, policy) for name, policy in policies.items()}
     return ways
-
-
-def _proposals(policy: Policy, count: int, seed: int, recent: RecentFrames) -> Float32[np.ndarray, "N F A"]:
-    """Returns a policy's plans from the last frames, with other draws at each frame."""
-    return policy.plans(recent.rgb, count, zlib.crc32(recent.rgb.tobytes(), seed) >> 1)
 
 
 def policy_actor(name: str, policy: Policy, trained: TrainedModel) -> MakeActor:

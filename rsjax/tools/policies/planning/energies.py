@@ -51,13 +51,14 @@ def imagined(model: TrainedModel, score: Score, frames: int = HISTORY) -> Energy
         frames: how many of the last frames the score looks at.
     """
 
-    return lambda recent, candidates: score(_planned(model, recent, candidates, frames).rgb)
+    return lambda recent, candidates: score(planned(model, recent, candidates, frames).rgb)
 
 
 def success(model: TrainedModel) -> Energy:
-    """Returns an energy: 1 - the probability of success that the model's own head reads at each candidate's end.
+    """Returns an energy: 1 - the mean over the horizon of the probability of success that the model's own head reads.
 
-    It takes a :class:`RecentFrames`, and decodes no picture but the last.
+    The mean, since a planner that looks at the end alone may put success off for ever. The energy takes a
+    :class:`RecentFrames`, and decodes no picture but the last.
 
     Raises:
         UserError: the model has no state heads.
@@ -65,15 +66,15 @@ def success(model: TrainedModel) -> Energy:
     head_judge(model)
 
     def energy(recent: RecentFrames, candidates: Float[np.ndarray, "N H A"]) -> Float[np.ndarray, " N"]:
-        state = _planned(model, recent, candidates, 1).state
+        state = planned(model, recent, candidates, 1).state
         assert state is not None
-        return 1 - state[:, -1, STATE.index("success")].astype(np.float64)
+        return 1 - state[:, :, STATE.index("success")].mean(axis=1, dtype=np.float64)
 
     return energy
 
 
-def _planned(model: TrainedModel, recent: RecentFrames, candidates: Float[np.ndarray, "N H A"], frames: int) -> Video:
-    """Returns the last frames of the videos that the model generates for the candidates."""
+def planned(model: TrainedModel, recent: RecentFrames, candidates: Float[np.ndarray, "N H A"], frames: int) -> Video:
+    """Returns the last frames of the videos that the model generates for the candidates, and the states of all."""
     before = np.repeat(recent.actions[None], len(candidates), axis=0)
     prompt = Video(recent.rgb[None], None if recent.depth is None else recent.depth[None])
     actions = np.concatenate([before, candidates], axis=1)

@@ -13,13 +13,17 @@ from rsjax.data.store import Store
 from rsjax.errors import UserError
 from rsjax.models.base import Assets, create_model
 from rsjax.models.trained import TrainedModel
+from rsjax.tools.policies.config import PolicyConfig
 from rsjax.tools.policies.judges.judge import HISTORY
 from rsjax.tools.policies.planning import closed_loop as planning
 from rsjax.tools.policies.planning import energies
 from rsjax.tools.policies.planning.closed_loop import PlanSettings, compare, folder, results_text
 from rsjax.tools.policies.planning.energies import RecentFrames, imagined, judged, pixel_distance, token_distance
 from rsjax.tools.policies.planning.planner import Planner, PlannerConfig, search
+from rsjax.tools.policies.planning.proposals import policy_rollouts
+from rsjax.tools.policies.worlds.model_world import FirstFrame, ModelWorld
 from rsjax.tools.policies.worlds.simulator_world import SimulatorWorld
+from rsjax.tools.policies.worlds.world import run_episodes
 from rsjax.tools.sim.expert import LiftState
 from tests.models.toy_family import ToyConfig
 from tests.tools.pipeline import toy
@@ -160,7 +164,7 @@ def test_success_is_read_from_the_models_own_head(tmp_path: Path) -> None:
     actions = np.concatenate([np.repeat(rows[None, :2], 2, 0), candidates], 1)
     state = model.plan(rgb, actions).state
     assert state is not None
-    np.testing.assert_allclose(found, 1 - state[:, -1, 0], rtol=1e-5)
+    np.testing.assert_allclose(found, 1 - state[:, :, 0].mean(1), rtol=1e-5)
     assert found[0] != found[1]
 
 
@@ -184,6 +188,33 @@ def test_a_policys_plans_are_candidates_and_where_the_first_search_begins() -> N
     np.testing.assert_allclose(seen[0][3], np.tile(-longer, 2), atol=1e-6)
     np.testing.assert_allclose(action, np.tile(-way[0], 2), atol=1e-6)  # nothing can be better
     assert planner.plan is not None and planner.plan.energy < 1e-9
+
+
+def test_a_policys_rollouts_are_its_episodes_in_the_world_model(model: TrainedModel) -> None:
+    def plans(frames: np.ndarray, seed: int = 0) -> np.ndarray:
+        seen = frames[:, -2:].mean((1, 2, 3), dtype=np.float64) / 255  # of each colour
+        return np.tile(seen - 0.5, 10)[:, :28, None].repeat(3, axis=2).swapaxes(1, 2).astype(np.float32)
+
+    taken: list[np.ndarray] = []
+    planned: list[np.ndarray] = []
+
+    def act(observation: dict[str, np.ndarray]) -> np.ndarray:
+        taken.append(observation["rgb"] if taken else first[None])  # the world shows it as the model sees it
+        if len(taken) % 2:
+            planned[:] = [plans(np.stack(taken[-2:], axis=1))]
+        return planned[0][:, (len(taken) - 1) % 2]
+
+    first = toy.clip(0).rgb[0]
+    policy: Any = SimpleNamespace(action_dim=28, executed_frames=2, model=SimpleNamespace(config=PolicyConfig()))
+    policy.plans = plans
+    depth = toy.clip(0).depth
+    assert depth is not None
+    recent = RecentFrames(first[None], depth[:1], np.zeros((1, 28), np.float32))
+    rolled = policy_rollouts(model, policy, 2, 5, 0, recent)
+    (episode,) = run_episodes(ModelWorld(model, 1, None), act, [FirstFrame(first, depth[0], 0)], 5)
+    np.testing.assert_array_equal(rolled[0], rolled[1])  # this policy draws nothing
+    np.testing.assert_allclose(rolled[0], episode.actions[1:], atol=1e-4)
+    assert np.ptp(rolled[0], axis=0).min() > 1e-3
 
 
 def test_the_distance_of_tokens_counts_bits(model: TrainedModel) -> None:
@@ -246,7 +277,8 @@ def test_a_comparison_resumes_and_counts(model: TrainedModel, tmp_path: Path, mo
     for number in range(2):  # another policy has another folder
         policy: Any = SimpleNamespace(action_dim=28, model=SimpleNamespace(image_size=64), key=str(number))
         policy.actor = lambda seed: lambda frames: np.ones((1, 28), np.float32)
-        policy.plans = lambda frames, count, seed: np.ones((count, 4, 28), np.float32)
+        policy.plans = lambda frames, seed: np.ones((len(frames), 4, 28), np.float32)
+        policy.executed_frames = 4
         other = compare(model, tmp_path, lift(), one, {"policy a/b": policy})
         assert other["ways"]["policy a/b"]["success"] == 1
         assert (folder(tmp_path, other["key"]) / "policy a-b-00.mp4").exists()
