@@ -215,7 +215,7 @@ class WorldModel(Trainable[B], Protocol[B]):
             actions: as for :meth:`generate`.
             depth: as for :meth:`generate`.
             last: return only this many frames, the last ones; a family need not decode the others. What state heads
-                read is of all generated frames.
+                read is of all frames, those of the prompt included.
             past: the actions that led from the beginning of the clip into the prompt's first frame, if that is a later
                 one; a family need not read them.
         """

@@ -31,9 +31,9 @@ class Options:
     """Also plan with the policy's own rollouts in the world model among the candidates."""
     episodes: int = 50
     """Episodes for each way to act, with equal starts."""
-    max_steps: int = 20
+    max_steps: int = 30
     """Largest number of frames in an episode."""
-    horizon: int = 6
+    horizon: int = 12
     """Frames that a candidate looks ahead."""
     candidates: int = 32
     """Action sequences per round."""

@@ -52,6 +52,7 @@ MakeActor: TypeAlias = Callable[[int, UInt8[np.ndarray, "S S 3"]], Actor]  # fro
 MEMORY = 2  # frames in the world model's prompt; one at an episode's beginning
 HEADINGS = ("way to act", "success", "95 % interval", "steps", "seconds a decision", "numbers clipped")
 VIDEOS = 3  # videos of each way to act
+MARGIN = 0.02  # a planner leaves a policy's own way only for an energy that is lower by this share
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,7 @@ class PlanSettings:
     energy: EnergyName = "judge"
     lpips_weights: str = ""
     episodes: int = 50
-    max_steps: int = 20
+    max_steps: int = 30
     warm_start: bool = False
 
     def __post_init__(self) -> None:
@@ -155,6 +156,7 @@ def actors(
     config = trained.config
     depth = config.model.uses_depth and trained.assets.normalization.depth_range is not None
     high = np.ones(config.clips.action_dim)
+    scale = np.asarray(trained.assets.normalization.action_std)
     controls = config.sim.control_steps
 
     def random(seed: int, goal: np.ndarray) -> Actor:
@@ -166,9 +168,11 @@ def actors(
 
         def make(seed: int, goal: np.ndarray) -> Actor:
             propose = None
+            own = search
             if policy is not None:
+                own = replace(search, margin=MARGIN)
                 propose = partial(policy_rollouts, trained, policy, search.candidates // 2, search.horizon, seed)
-            planner = Planner(energy_of(trained, run, settings, goal), -high, high, search, propose)
+            planner = Planner(energy_of(trained, run, settings, goal), -high, high, own, propose, scale)
             return PlanningActor(planner, len(high), depth)
 
         return make

@@ -68,7 +68,8 @@ def success(model: TrainedModel) -> Energy:
     def energy(recent: RecentFrames, candidates: Float[np.ndarray, "N H A"]) -> Float[np.ndarray, " N"]:
         state = planned(model, recent, candidates, 1).state
         assert state is not None
-        return 1 - state[:, :, STATE.index("success")].mean(axis=1, dtype=np.float64)
+        horizon = candidates.shape[1]  # before it are the prompt's frames
+        return 1 - state[:, -horizon:, STATE.index("success")].mean(axis=1, dtype=np.float64)
 
     return energy
 

@@ -33,19 +33,21 @@ class PlannerConfig:
         method: "cem": the new mean and deviation are those of the ``elites`` best candidates (Rubinstein's
             cross-entropy method); "mppi": the new mean is that of all candidates, weighted by exp(-energy/λ), and the
             deviation stays the same (Williams et al. 2017).
-        horizon: steps of a candidate.
+        horizon: steps of a candidate; a task that takes longer looks the same under all of them.
         candidates: candidates in each round; they include the mean itself and the best candidate so far.
         rounds: rounds of a decision.
         elites: for "cem".
         temperature: λ for "mppi", in standard deviations of the candidates' finite energies.
-        spread: standard deviation of the first candidates, as a share of half the actions' range.
+        spread: standard deviation of the first candidates, as a share of the actions' scale.
         memory: correlation of a candidate's noise from one step to the next, so that arms do not tremble.
-        hold: controls in an action; the search holds one control for all of them.
+        hold: controls in an action; the noise is the same for all of them.
+        margin: how much lower than that of the mean it began with an energy must be, as a share, for a search to leave
+            this mean. While the energy is nearly the same for all candidates, the planner then does as it began.
         seed: seed of the draws.
     """
 
     method: Literal["cem", "mppi"] = "cem"
-    horizon: int = 6
+    horizon: int = 12
     candidates: int = 32
     rounds: int = 3
     elites: int = 6
@@ -53,12 +55,13 @@ class PlannerConfig:
     spread: float = 0.6
     memory: float = 0.6
     hold: int = 1
+    margin: float = 0.0
     seed: int = 0
 
     def __post_init__(self) -> None:
         require_range(self, "planner", 1, 2**31, "horizon", "rounds", "hold")
         require_range(self, "planner", 2, 2**31, "candidates")
-        require_range(self, "planner", 0, 0.999, "memory")
+        require_range(self, "planner", 0, 0.999, "memory", "margin")
         require_range(self, "planner", 1, self.candidates, "elites")
         for name in ("temperature", "spread"):
             require(getattr(self, name) > 0, f"planner.{name} is {getattr(self, name)}; it must be above 0")
@@ -71,7 +74,7 @@ class PlannedActions:
     """The result of a search.
 
     Attributes:
-        actions: the best candidate of all rounds.
+        actions: the best candidate of all rounds, or the mean that the search began with.
         energy: its energy.
         best: the lowest energy so far after each round.
     """
@@ -87,6 +90,7 @@ def search(
     mean: Float[np.ndarray, "H A"],
     low: Float[np.ndarray, " A"],
     high: Float[np.ndarray, " A"],
+    scale: Float[np.ndarray, " A"],
     config: PlannerConfig,
     rng: np.random.Generator,
     proposals: Float[np.ndarray, "N H A"] | None = None,
@@ -99,17 +103,20 @@ def search(
         mean: where the search begins.
         low: least actions; candidates are clipped to [low, high].
         high: greatest actions.
+        scale: standard deviation of usual actions, which is that of candidates for a ``config.spread`` of 1.
         proposals: further candidates of the first round, in place of drawn ones; as many of them as there is room for.
 
     Raises:
         UserError: the energies have the wrong shape, or one is NaN or -inf.
     """
-    deviation = np.broadcast_to(config.spread * (high - low) / 2, mean.shape)
+    deviation = np.broadcast_to(config.spread * scale, mean.shape)
+    start = mean
     best = mean
     lowest = np.inf
+    at_start = np.inf
     history = []
     for number in range(config.rounds):
-        drawn = mean + deviation * _noise(config, len(low), rng)
+        drawn = mean + deviation * np.tile(_noise(config, len(low) // config.hold, rng), config.hold)
         drawn[0] = mean
         drawn[1] = best
         if proposals is not None and number == 0:
@@ -123,6 +130,8 @@ def search(
                 f"the energy of {len(drawn)} candidates has shape {energies.shape}, {wrong.sum()} of it NaN or -inf; "
                 f"expected ({len(drawn)},), numbers"
             )
+        if number == 0:
+            at_start = float(energies[0])
         first = int(energies.argmin())
         if energies[first] < lowest:
             best = drawn[first]
@@ -134,11 +143,14 @@ def search(
         if config.method == "cem":
             elites = drawn[np.argsort(energies, kind="stable")[: min(config.elites, finite.sum())]]
             mean = elites.mean(0)
-            deviation = elites.std(0) + 0.05 * (high - low) / 2
+            deviation = elites.std(0) + 0.05 * scale
         else:
-            scale = config.temperature * max(float(energies[finite].std()), 1e-12)
-            weights = np.exp(-(energies - energies[first]) / scale)
+            width = config.temperature * max(float(energies[finite].std()), 1e-12)
+            weights = np.exp(-(energies - energies[first]) / width)
             mean = np.einsum("n,nha->ha", weights / weights.sum(), drawn)
+    if lowest > (1 - config.margin) * at_start:
+        best = np.clip(start, low, high)
+        lowest = at_start
     return PlannedActions(best.astype(np.float32), lowest, np.array(history))
 
 
@@ -150,8 +162,9 @@ class Planner:
         low: least actions.
         high: greatest actions.
         config: how it searches.
-        propose: returns action sequences (N, H, A) from the energy's first argument, such as a policy's plans. They are
-            candidates of every search, and the first search begins with the first of them.
+        propose: returns action sequences (N, H, A) from the energy's first argument, such as a policy's rollouts. They
+            are candidates of every search, which begins with the first of them.
+        scale: standard deviation of usual actions; by default half of their range.
 
     Attributes:
         plan: the plan of the last decision; None before the first decision.
@@ -167,6 +180,7 @@ class Planner:
         high: Float[np.ndarray, " A"],
         config: PlannerConfig,
         propose: Propose | None = None,
+        scale: Float[np.ndarray, " A"] | None = None,
     ) -> None:
         require(
             len(low) % config.hold == 0,
@@ -175,7 +189,9 @@ class Planner:
         self._energy = energy
         self._config = config
         self._propose = propose
-        self._low, self._high = (np.asarray(each)[: len(low) // config.hold] for each in (low, high))
+        self._low = np.asarray(low)
+        self._high = np.asarray(high)
+        self._scale = (self._high - self._low) / 2 if scale is None else np.asarray(scale)
         self.reset()
 
     def reset(self) -> None:
@@ -189,23 +205,19 @@ class Planner:
         Args:
             frames: the first argument of the energy.
         """
-        mean = np.tile((self._low + self._high) / 2, (self._config.horizon, 1))
+        horizon = self._config.horizon
+        mean = np.tile((self._low + self._high) / 2, (horizon, 1))
+        if self.plan is not None:
+            mean = np.concatenate([self.plan.actions[1:], self.plan.actions[-1:]])
         proposals = None
         if self._propose is not None:
             proposed = self._propose(frames)
-            # As long as the horizon (the last action goes on), as means of an action's controls.
-            rows = np.minimum(np.arange(self._config.horizon), proposed.shape[1] - 1)
-            proposals = proposed[:, rows].reshape(len(proposed), len(rows), self._config.hold, -1).mean(axis=2)
-            mean = proposals[0]
-        if self.plan is not None:
-            mean = np.concatenate([self.plan.actions[1:], self.plan.actions[-1:]])
-
-        def energy(frames: Any, candidates: Float[np.ndarray, "N H a"]) -> Float[np.ndarray, " N"]:
-            return self._energy(frames, np.tile(candidates, (1, 1, self._config.hold)))
-
-        limits = (self._low, self._high)
-        self.plan = search(energy, frames, mean, *limits, self._config, self._rng, proposals)
-        return np.tile(self.plan.actions[0], self._config.hold)
+            rows = np.minimum(np.arange(horizon), proposed.shape[1] - 1)  # the last action goes on
+            proposals = np.concatenate([mean[None], proposed[:, rows]])
+            mean = proposals[1]
+        limits = (self._low, self._high, self._scale)
+        self.plan = search(self._energy, frames, mean, *limits, self._config, self._rng, proposals)
+        return self.plan.actions[0]
 
 
 def _noise(config: PlannerConfig, width: int, rng: np.random.Generator) -> Float[np.ndarray, "N H A"]:

@@ -46,7 +46,7 @@ def distance_on_the_way(start: np.ndarray, candidates: np.ndarray) -> np.ndarray
 @pytest.mark.parametrize("method", ["cem", "mppi"])
 def test_a_search_finds_the_way_to_the_goal_and_a_closed_loop_reaches_it(method: Any) -> None:
     config = PlannerConfig(method, horizon=4, candidates=100, rounds=8, elites=10, temperature=0.1)
-    plan = search(distance, np.zeros(2), np.zeros((4, 2)), LOW, HIGH, config, np.random.default_rng(0))
+    plan = search(distance, np.zeros(2), np.zeros((4, 2)), LOW, HIGH, HIGH, config, np.random.default_rng(0))
     assert plan.energy == pytest.approx(distance(np.zeros(2), plan.actions[None])[0])
     assert plan.energy < 0.02 < distance(np.zeros(2), np.zeros((1, 4, 2)))[0]
     assert (np.diff(plan.best) <= 0).all() and plan.best[-1] < plan.best[0]
@@ -69,7 +69,7 @@ def test_impossible_candidates_are_left_out_of_the_search(method: Any) -> None:
         return np.where(hit, np.inf, distance(start, candidates))
 
     config = PlannerConfig(method, horizon=4, candidates=100, rounds=8, elites=10, temperature=0.1)
-    inputs: Any = (np.zeros(2), np.zeros((4, 2)), LOW, HIGH, config, np.random.default_rng(0))
+    inputs: Any = (np.zeros(2), np.zeros((4, 2)), LOW, HIGH, HIGH, config, np.random.default_rng(0))
     assert search(walled, *inputs).energy < 0.05
     nowhere = search(lambda _, rows: np.full(len(rows), np.inf), *inputs)
     assert nowhere.energy == np.inf and np.isfinite(nowhere.actions).all()
@@ -83,7 +83,7 @@ def test_the_mean_of_elites_leaves_impossible_candidates_out() -> None:
         return np.where(np.arange(len(candidates)) == 5, 1.0, np.inf)
 
     config = PlannerConfig("cem", horizon=2, candidates=8, rounds=2, elites=4)
-    plan = search(only_one, None, np.zeros((2, 2)), LOW, HIGH, config, np.random.default_rng(0))
+    plan = search(only_one, None, np.zeros((2, 2)), LOW, HIGH, HIGH, config, np.random.default_rng(0))
     np.testing.assert_array_equal(means[1], plan.actions)
 
 
@@ -93,7 +93,7 @@ def test_held_controls_repeat_and_wrong_energies_are_named() -> None:
     planner = Planner(lambda _, rows: seen.append(rows) or rows.sum((1, 2)), -np.ones(6), np.ones(6), config)  # type: ignore[func-returns-value]
     action = planner(None)
     np.testing.assert_array_equal(action.reshape(3, 2), np.tile(action[:2], (3, 1)))
-    assert seen[0].shape == (8, 6, 6)
+    assert seen[0].shape == (8, 12, 6)
     with pytest.raises(ConfigError, match="planner.hold is 4; it must divide the 6 numbers"):
         Planner(distance, -np.ones(6), np.ones(6), replace(config, hold=4))
     with pytest.raises(ConfigError, match="planner.elites is 9"):
@@ -164,30 +164,37 @@ def test_success_is_read_from_the_models_own_head(tmp_path: Path) -> None:
     actions = np.concatenate([np.repeat(rows[None, :2], 2, 0), candidates], 1)
     state = model.plan(rgb, actions).state
     assert state is not None
-    np.testing.assert_allclose(found, 1 - state[:, :, 0].mean(1), rtol=1e-5)
-    assert found[0] != found[1]
+    np.testing.assert_allclose(found, 1 - state[:, 2:, 0].mean(1), rtol=1e-5)  # after the prompt
+    assert abs(found[0] - found[1]) > 0
 
 
-def test_a_policys_plans_are_candidates_and_where_the_first_search_begins() -> None:
+def test_every_search_begins_with_a_policys_way_and_leaves_it_for_a_clearly_better_one() -> None:
     seen: list[np.ndarray] = []
-    way = np.array([[0.5, -0.5], [0.25, 0.75]])  # two frames of one control, held twice
-    plans = np.stack([np.tile(way, 2), np.tile(-way, 2)])
-    plans[0, 0, :2] += 0.1  # controls of a frame are averaged
-    plans[0, 0, 2:] -= 0.1
+    way = np.array([[0.5, -0.5, 0.3, -0.7], [0.25, 0.75, 0.25, 0.75]])  # two frames of two controls
+    plans = np.stack([way, -way])
+    wanted = np.concatenate([-way, -way[1:]])
 
     def energy(frames: Any, rows: np.ndarray) -> np.ndarray:
         seen.append(rows)
-        return np.square(rows[:, :, :2] - np.concatenate([-way, -way[1:]])).sum((1, 2))
+        return 1 + np.square(rows - wanted).sum((1, 2))
 
-    config = PlannerConfig(horizon=3, candidates=8, rounds=2, hold=2)
-    planner = Planner(energy, np.tile(LOW, 2), np.tile(HIGH, 2), config, lambda frames: plans)
-    action = planner(None)
+    def planner(**settings: float) -> Planner:
+        config = replace(PlannerConfig(horizon=3, candidates=8, rounds=2, hold=2), **settings)
+        scale = np.array([0.1, 0.0, 0.1, 0.0])
+        return Planner(energy, np.tile(LOW, 2), np.tile(HIGH, 2), config, lambda frames: plans, scale)
+
+    one = planner()
+    action = one(None)
     longer = np.concatenate([way, way[1:]])
-    np.testing.assert_allclose(seen[0][0], np.tile(longer, 2), atol=1e-6)  # the mean
-    np.testing.assert_allclose(seen[0][2], np.tile(longer, 2), atol=1e-6)
-    np.testing.assert_allclose(seen[0][3], np.tile(-longer, 2), atol=1e-6)
-    np.testing.assert_allclose(action, np.tile(-way[0], 2), atol=1e-6)  # nothing can be better
-    assert planner.plan is not None and planner.plan.energy < 1e-9
+    np.testing.assert_allclose(seen[0][[0, 3, 4]], np.stack([longer, longer, -longer]), atol=1e-6)
+    noise = seen[0][5:] - longer
+    np.testing.assert_allclose(noise[..., :2], noise[..., 2:], atol=1e-6)  # the same in both controls of a frame
+    assert 0.02 < noise[..., 0].std() < 0.2 and not noise[..., 1].any()
+    np.testing.assert_allclose(action, -way[0], atol=1e-6)  # nothing can be better
+    assert one.plan is not None and one.plan.energy == pytest.approx(1)
+    np.testing.assert_allclose(planner(margin=0.95)(None), way[0], atol=1e-6)
+    one(None)
+    np.testing.assert_allclose(seen[-2][2], np.concatenate([-way[1:], -way[1:], -way[1:]]), atol=1e-6)  # the last plan
 
 
 def test_a_policys_rollouts_are_its_episodes_in_the_world_model(model: TrainedModel) -> None:
