@@ -74,13 +74,16 @@ def with_values(config: T, values: Mapping[str, Any]) -> T:
 
 
 def converted_section(section: Any, kind: Any) -> Any:
-    """Returns the section as one of another class, with the values of the fields that both have."""
+    """Returns the section as one of another class, with the values of the fields that both have and that it allows."""
     if kind is None:
         return None
     if section is None:
         return kind()
-    names = {field.name for field in dataclasses.fields(kind)}
-    return kind(**{name: value for name, value in vars(section).items() if name in names})
+    hints = typing.get_type_hints(kind)
+    shared = {field.name for field in dataclasses.fields(kind)} & vars(section).keys()
+    values = {name: getattr(section, name) for name in shared}
+    choices = {name: typing.get_args(hints[name]) for name in shared if typing.get_origin(hints[name]) is Literal}
+    return kind(**{name: value for name, value in values.items() if value in choices.get(name, (value,))})
 
 
 def with_sections(config: T, names: Iterable[str]) -> T:

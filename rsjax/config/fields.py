@@ -33,7 +33,10 @@ def runtime(default: Any) -> Any:
 
 
 def sampling(default: Any) -> Any:
-    """Returns a dataclass field that changes generated videos but not training; content keys leave it out."""
+    """Returns a dataclass field that changes generated videos but not training; content keys leave it out.
+
+    With an early stop, videos choose a training's weights; then its key has these fields, too.
+    """
     return field(default=default, metadata={"sampling": True})
 
 

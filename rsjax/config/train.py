@@ -127,8 +127,9 @@ class CurriculumStageConfig:
 
 @dataclass(frozen=True)
 class EarlyStopConfig:
-    """Ends a training that has stopped to improve on held-out clips; its weights are those of the best validation.
+    """Ends a training that no longer improves on held-out clips; its weights are those of the best validation.
 
+    With a curriculum it ends in the last stage, whose validations alone count for the patience.
     Held-out clips are the split "validation" of the run's store, or the split "test" if there is none.
     """
 
@@ -204,12 +205,14 @@ class LoopConfig(RuntimeConfig, TrainConfig):
 
     Attributes:
         restarts: steps at which the learning rate schedule starts again; the curriculum's stages set them.
+        last_stage: the step at which the curriculum's last stage begins; an early stop ends no stage before it.
         skip_budget: how many steps with a loss or gradient that is not finite are skipped before training stops.
         keep_last, keep_every, keep_best: the checkpoints that stay: the newest ones, those at multiples of so many
             steps (0: none), and the one with the best validation loss, if there are validations.
     """
 
     restarts: tuple[int, ...] = ()
+    last_stage: int = 0
     skip_budget: int = runtime(10)
     keep_last: int = runtime(2)
     keep_every: int = runtime(0)

@@ -97,7 +97,12 @@ def write_clips(
                         f"clip {count}: {name} has the shape {shape}, that of the first clip {first[name]}{hint}"
                     )
             episodes.setdefault(record["provenance"]["episode"], _Episode()).add(record, count)
-            scored |= "success" in given
+            labelled = given.get("success") is not None
+            if count and labelled != scored:
+                raise StoreError(
+                    f"clip {count}: success is given for some clips and not for others; give it for all, or for none"
+                )
+            scored = labelled
             payload = encode(record)
             digest.update(payload)
             with disk_guard(path):  # errors from reading the clips stay the caller's
@@ -186,8 +191,12 @@ def _record(clip: Mapping[str, Any], where: str, number: int) -> Record:
             f"{where}: row 0 of actions is not zeros; row t is what led from frame t-1 into frame t: {cure}"
         )
     depth = None
+    origin = {"source": "write_store", "episode": number} | _provenance(clip, where)
     depth_unit = ""
     if clip.get("depth") is not None:
+        known = origin.get("depth_unit") or "metres"
+        if known != "metres":
+            raise StoreError(f"{where}: its provenance says that depth is {known}, not in metres; leave depth out")
         depth_unit = "metres"
         depth = _array(clip, "depth", where, f"metres ({count}, {size}, {size})", np.float32, (count, size, size))
         if depth.min() <= 0:
@@ -197,7 +206,6 @@ def _record(clip: Mapping[str, Any], where: str, number: int) -> Record:
     if clip.get("tracks") is not None:
         tracks = _array(clip, "tracks", where, f"numbers (N, {count}, 2)", np.float32, (None, count, 2))
         visible = _array(clip, "visible", where, f"bool {tracks.shape[:2]}", np.bool_, tracks.shape[:2])
-    origin = {"source": "write_store", "episode": number} | _provenance(clip, where)
     words = {name: _text(clip, name, where) or words_of(origin.get(name)) or UNKNOWN for name in _LABELS}
     timing: dict[str, Any] = {}
     if clip.get("fps") is not None:

@@ -76,14 +76,14 @@ def loader_factory(loop: LoopConfig, own: Store, transform: Transform, directory
     """Resolves the stages of a loop's curriculum into records and steps, and returns what makes its loaders.
 
     Args:
-        loop: the loop; without ``stages`` it reads all of ``own`` for ``loop.steps`` steps.
+        loop: the loop; without a ``curriculum`` it reads all of ``own`` for ``loop.steps`` steps.
         own: the store that components read unless they name another.
         transform: of all stores' records.
         directory: where the list of damaged records is.
 
     Returns:
-        The factory of its loaders; its ``loop`` has ``steps`` (of each stage, rounded up to whole batches) and
-        ``restarts`` set.
+        The factory of its loaders; its ``loop`` has ``steps`` (of each stage, rounded up to whole batches),
+        ``restarts`` and ``last_stage`` set.
 
     Raises:
         StoreError: a component's store cannot be read or mixed with ``own``, or no record passes its patterns.
@@ -95,7 +95,7 @@ def loader_factory(loop: LoopConfig, own: Store, transform: Transform, directory
         restarts = tuple(
             first for first, stage in zip(firsts, loop.curriculum, strict=False) if stage.restart and first > 0
         )
-        loop = replace(loop, steps=firsts[-1], restarts=restarts)
+        loop = replace(loop, steps=firsts[-1], restarts=restarts, last_stage=firsts[-2])
     return LoaderFactory(loop, tuple(resolved), directory / NAME)
 
 

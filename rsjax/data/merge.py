@@ -100,7 +100,7 @@ def by_label(path: Path, column: str, folder: Path) -> dict[Path, Numbers]:
 
 
 def into_parts(path: Path, count: int, folder: Path) -> dict[Path, Numbers]:
-    """Returns parts for :func:`split`: ``count`` stores in ``folder``, whose sizes differ by at most one record."""
+    """Returns parts for :func:`split`: ``count`` stores in ``folder``, whose splits differ by at most one record."""
     sizes = open_store(path).counts()
     return {
         folder / f"part-{part:03d}": {name: list(range(part, size, count)) for name, size in sizes.items()}
@@ -136,7 +136,8 @@ def _copies(
 def _write_part(store: Store, numbers: Numbers, out: Path, key: str) -> None:
     meta = {name: value for name, value in store.manifest.items() if name not in (*OF_WHOLE, "action_count")}
     if store.manifest.get("success_share") is not None:
-        ends = [store.source(name)[number]["success"][-1] for name in store.splits for number in numbers[name]]
+        sources = {name: store.source(name) for name in store.splits}
+        ends = [source[number]["success"][-1] for name, source in sources.items() for number in numbers[name]]
         meta["success_share"] = sum(map(bool, ends)) / len(ends)
     labelled = _labelled([store])
     splits = {name: _copies([(store, name, numbers[name])], labelled, {}) for name in store.splits}

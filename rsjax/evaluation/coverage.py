@@ -193,5 +193,5 @@ def coverage_key(trained: TrainedModel, store: Store, clips: int = CLIPS) -> str
     """Returns the content key of a bank: weights, tokenizer, normalization, clips and settings."""
     assets = trained.assets
     weights = fingerprint((trained.params, assets.tokenizer))
-    settings = (str(trained.config.model), trained.config.prompt_frames, str(assets.normalization))
+    settings = (trained.config.model, trained.config.prompt_frames, str(assets.normalization))
     return content_key("coverage", RECIPE, weights, *settings, str(store.manifest.get("key")), clips, NEAREST)

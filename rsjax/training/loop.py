@@ -75,7 +75,8 @@ def fit(
         CheckpointError: the newest checkpoint does not fit, or none can be read.
         DivergedError: too many steps were skipped; their batches are recorded.
         Preempted: the process received SIGTERM; everything up to the current step is saved.
-        StoreError: too many records are damaged, or the disk is full.
+        StoreError: too many records are damaged.
+        FileError: the disk is full.
     """
     if not resume and is_lead():
         shutil.rmtree(directory / "checkpoints", ignore_errors=True)
@@ -172,9 +173,12 @@ def fit(
 
 
 def exhausted(loop: LoopConfig, best: int | None, step: int) -> bool:
-    """Returns whether a training ends early at this step: its patience is over since the best validation."""
+    """Returns whether a training ends early at this step: its patience is over since the best validation.
+
+    Validations before the curriculum's last stage do not count, since its clips may be others.
+    """
     stop = loop.early_stop
-    return stop is not None and best is not None and step - best >= stop.every * stop.patience
+    return stop is not None and best is not None and step - max(best, loop.last_stage) >= stop.every * stop.patience
 
 
 def _is_due(step: int, every: int, last: int) -> bool:

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rsjax.config import Config, ConfigError, content_key, from_dict, presets, to_dict
+from rsjax.config import Config, ConfigError, Muon, content_key, from_dict, presets, to_dict
 from rsjax.config.config_fields import config_fields, with_sections, with_values
 
 DEBUG = presets.debug()
@@ -110,6 +110,14 @@ def test_a_section_is_changed_by_its_word_by_itself_or_by_a_field_in_it() -> Non
     assert with_values(parts, {"extra": "on"}).extra == with_values(parts, {"extra.rate": 1.0}).extra == Slow()
     assert with_values(Parts(extra=Slow()), {"extra": "off"}) == with_values(Parts(), {"extra": None}) == Parts()
     assert with_sections(Parts(), ["extra.rate", "driver.rate"]) == Parts(extra=Slow())
+
+
+def test_a_section_of_another_class_takes_no_choice_that_it_does_not_have() -> None:
+    full = presets.get("roboscape_s")
+    assert full.tokenizer_train.optimizer.schedule == "steps"
+    changed = with_values(full, {"tokenizer_train.optimizer": "muon"})
+    assert changed.tokenizer_train.optimizer == Muon(learning_rate=1e-4, warmup_steps=0)
+    assert from_dict(Config, to_dict(changed)) == changed
 
 
 @pytest.mark.parametrize("parts", [Parts(), Parts(Slow(rate=3.0), Slow())])

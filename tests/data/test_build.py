@@ -50,6 +50,8 @@ def test_a_store_of_pictures_and_actions_alone_can_be_trained_on(tmp_path: Path)
     config = on_store(presets.debug(), tmp_path / "mine")
     assert (config.clips.frames, config.clips.image_size, config.clips.action_dim) == (FRAMES, SIZE, 3)
     assert store.manifest["success_share"] is None
+    unknown = rsjax.write_store(tmp_path / "mine", (clip(number, success=None) for number in range(2)))
+    assert unknown.manifest["success_share"] is None
 
 
 def test_the_key_follows_the_content(tmp_path: Path) -> None:
@@ -130,6 +132,11 @@ WRONG = [
     (
         {"tracks": np.zeros((5, FRAMES, 2)), "visible": np.ones((5, FRAMES), bool)},
         r"tracks has the shape \(5, 4, 2\), .* \(256, 4, 2\); without tracks a clip gets 256 that are never visible",
+    ),
+    ({"success": True}, "success is given for some clips and not for others; give it for all, or for none"),
+    (
+        {"depth": np.ones((FRAMES, SIZE, SIZE)), "provenance": {"depth_unit": "relative"}},
+        "its provenance says that depth is relative, not in metres; leave depth out",
     ),
     ({"tsak": "push"}, "no field 'tsak'; did you mean 'task'"),
     ({"actions": np.zeros((FRAMES, 4))}, r"actions has the shape \(4, 4\), that of the first clip \(4, 3\)"),

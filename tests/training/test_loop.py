@@ -238,3 +238,9 @@ def test_an_early_stop_uses_the_best_weights_killed_or_not(tmp_path: Path, stop_
     assert Checkpoints(tmp_path / "checkpoints").steps() == [3, 6]
     best = train(replace(LOOP, steps=20), tmp_path / "best", stop_at=3)
     assert_same(stopped, best)
+
+
+def test_an_early_stop_ends_no_stage_of_a_curriculum_but_the_last(tmp_path: Path) -> None:
+    early = replace(LOOP, steps=20, checkpoint_every=1, keep_last=1, early_stop=EarlyStopConfig(every=1, patience=3))
+    train(replace(early, last_stage=7), tmp_path, validate=rising_after(3))
+    assert Checkpoints(tmp_path / "checkpoints").steps() == [3, 10]

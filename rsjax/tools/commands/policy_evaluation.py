@@ -75,7 +75,7 @@ def main() -> None:
         print((place / "results.md").read_text(), place, sep="\n")
         return
     for run in runs.values():  # checked before hours of training
-        run.check_world(first)
+        run.check_world(first, judge)
     first.world_judge(judge)
     rule = frames_in_a_row(first.run)
     config = first.simulator

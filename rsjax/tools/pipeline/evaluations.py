@@ -35,7 +35,7 @@ from rsjax.tools.pipeline.run import RECIPE, Run
 from rsjax.tools.pipeline.run_clips import relocated
 from rsjax.tools.pipeline.videos import resampled
 from rsjax.tools.sim import probes, retakes
-from rsjax.training.distributed import barrier, is_lead, on_lead
+from rsjax.training.distributed import agree, barrier, is_lead, on_lead
 
 FOLDER = "evaluations"
 MOST_FRAMES = 10_000_000  # generated for an evaluation; the authors' 1,200 clips, five times, of 48 frames: 2 million
@@ -181,10 +181,9 @@ def evaluate_into(
     key = _key(trained, store, eval_clips)
     parts = _parts(folder, key)
     skipped = f"{folder}: up to date, skipped (--overwrite evaluates again)"
-    if not overwrite and _key_of(folder) == key:
+    if agree(not overwrite and _key_of(folder) == key, "evaluated before"):
         if is_lead():
             note(skipped)
-        barrier("evaluation")
         return
 
     def clear() -> None:

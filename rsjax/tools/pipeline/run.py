@@ -121,9 +121,9 @@ class Run:
 
             evaluation = by_content(cfg.eval)
         settings: dict[str, tuple[Any, ...]] = {
-            "tokenizer": (cfg.autoencoder, cfg.tokenizer_train),
+            "tokenizer": (cfg.autoencoder, cfg.tokenizer_train, *validated_on(cfg, "tokenizer").values()),
             "tokens": cfg.model.token_shifts,
-            "world_model": (cfg.model, cfg.prompt_frames, cfg.train),
+            "world_model": (cfg.model, cfg.prompt_frames, cfg.train, *validated_on(cfg, "world_model").values()),
             "evaluation": (sampling_settings(cfg.model), evaluation),
             "report": (),
         }
@@ -214,7 +214,7 @@ class Run:
         decided = []
         for config in (saved, self.config):
             own = config.model.own_autoencoder
-            values: dict[str, Any] = {}
+            values = validated_on(config, stage)
             for part in DECIDED_BY[stage]:
                 if part == "tokenizer" and own is not None:
                     values |= dict(_deciding(own, "model.autoencoder"))
@@ -263,6 +263,15 @@ class Run:
         folder = self.directory / stage
         with make_once(folder, self.keys()[stage], refuse=None, again=True, keep=True, locked=False):
             yield folder
+
+
+def validated_on(config: Config, stage: str) -> dict[str, Any]:
+    """Returns the settings of the validation that chooses a stage's weights, by name; empty without an early stop."""
+    if stage == "tokenizer" and config.tokenizer_train.early_stop is not None:
+        return {"eval.clips": config.eval.clips}
+    if stage == "world_model" and config.train.early_stop is not None:
+        return {"eval.batch_size": config.eval.batch_size, "model.sample": sampling_settings(config.model)}
+    return {}
 
 
 def _deciding(value: Any, name: str) -> Iterator[tuple[str, Any]]:

@@ -15,6 +15,7 @@ from rsjax.data.store import Store
 from rsjax.errors import UserError
 from rsjax.progress import note
 from rsjax.tools.policies.diffusion_policy import Range
+from rsjax.tools.sim.episode import begins_episode
 
 Only = Literal["success", "all"]
 
@@ -79,7 +80,7 @@ def load_demos(store: Store, splits: Sequence[str], only: Only = "success", seed
     """Reads a store's clips as demonstrations, in an order that depends on the seed alone.
 
     Args:
-        only: "success" takes the clips that end in success, if the store says which do, and otherwise all.
+        only: which clips, as of :func:`is_demo`.
 
     Raises:
         UserError: the store has no such clip.
@@ -90,7 +91,7 @@ def load_demos(store: Store, splits: Sequence[str], only: Only = "success", seed
     for split in splits:
         for _, clip in readable(store.source(split)):
             controls = controls_of(clip, store.manifest)
-            if not labelled or clip["success"][-1]:
+            if is_demo(clip, only, labelled):
                 records.append({"rgb": clip["rgb"], "actions": clip["actions"]})
     if not records:
         if labelled:
@@ -102,6 +103,19 @@ def load_demos(store: Store, splits: Sequence[str], only: Only = "success", seed
         )
     order = np.random.default_rng(seed).permutation(len(records))
     return Demos(tuple(records[number] for number in order), controls)
+
+
+def is_demo(clip: Record, only: Only, labelled: bool) -> bool:
+    """Returns whether a clip is a demonstration.
+
+    Args:
+        only: "success" takes the clips that begin as their episodes do and end in success: in a clip that begins in the
+            middle, the task may be done before. "all" takes every clip.
+        labelled: whether the store says which clips end in success; if not, their ends are not looked at.
+    """
+    if only == "all":
+        return True
+    return begins_episode(clip) and (not labelled or bool(clip["success"][-1]))
 
 
 def chooses(store: Store, only: Only) -> bool:

@@ -4,6 +4,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import islice
 from pathlib import Path
 
 from rsjax.config import Config, SimConfig, content_key, from_dict
@@ -20,12 +21,13 @@ from rsjax.tools.pipeline.run_clips import relocated
 from rsjax.tools.policies.config import PolicyConfig, policy_preset
 from rsjax.tools.policies.demos import Demos, Only, load_demos
 from rsjax.tools.policies.judges.head_judge import NAME as HEAD
-from rsjax.tools.policies.judges.head_judge import HeadJudge, head_judge
+from rsjax.tools.policies.judges.head_judge import HeadJudge, check_heads, head_judge
 from rsjax.tools.policies.judges.judge import Judge
 from rsjax.tools.policies.judges.judge_training import FOLDER
 from rsjax.tools.policies.judges.trained_judge import load_judge
 from rsjax.tools.policies.worlds.actions import check_takes_actions
 from rsjax.tools.policies.worlds.model_world import FirstFrame, ModelWorld
+from rsjax.tools.sim.episode import begins_episode
 
 TAKEN = {"policy", "simulator", "videos"}  # folders beside those of the runs, in the results of policy_evaluation
 
@@ -108,13 +110,19 @@ class RunData:
             return HeadJudge(in_a_row)
         return self.judge(folder)
 
-    def check_world(self, like: "RunData") -> None:
+    def check_world(self, like: "RunData", judge: Path | None = None) -> None:
         """Checks, without loading weights, that policies of another run's clips can act in this run's model.
 
+        Args:
+            judge: as of :meth:`world_judge`.
+
         Raises:
-            UserError: the run is unfinished, its model takes no actions, or frames or actions differ in size.
+            UserError: the run is unfinished, its model takes no actions or lacks the judge's heads, or frames or
+                actions differ in size.
         """
         check_takes_actions(self.config.model, f"{self.run}: the model")
+        if judge == Path(HEAD):
+            check_heads(self.config.model, str(self.run))
         shapes = [(clips.image_size, clips.action_dim) for clips in (self.config.clips, like.config.clips)]
         if shapes[0] != shapes[1]:
             raise UserError(
@@ -133,9 +141,9 @@ class RunData:
         return load_judge(folder or self.run / FOLDER, self.config.clips.image_size)
 
     def first_frames(self, count: int, split: str = "train") -> list[FirstFrame]:
-        """Returns the first frames of ``count`` clips, with depth if the clips have it."""
-        source = self.clips.source(split)
-        chosen = readable(source, range(min(count, len(source))))
+        """Returns the first frames of ``count`` clips that begin as their episodes do, with depth if they have it."""
+        clips = readable(self.clips.source(split))
+        chosen = islice((pair for pair in clips if begins_episode(pair[1])), count)
         return [
             FirstFrame(clip["rgb"][0], None if clip["depth"] is None else clip["depth"][0], number, number)
             for number, clip in chosen

@@ -12,6 +12,7 @@ from rsjax.clip import Clip
 from rsjax.config import SimConfig, to_dict
 from rsjax.config.metaworld import SIMPLE
 from rsjax.config.sim import CONTROLS
+from rsjax.data.codec import Record
 from rsjax.tools.sim import expert, lift, metaworld, panda, rope, tabletop
 from rsjax.tools.sim.render import Camera, View
 from rsjax.tools.sim.scenery import SEEN, Change, Variation, draw_variation
@@ -284,6 +285,11 @@ def run_episode(sim: Simulator, config: SimConfig, plan: EpisodePlan) -> Clip:
         provenance=provenance,
         second=second,
     )
+
+
+def begins_episode(clip: Record) -> bool:
+    """Returns whether a clip begins where its episode does, and not in its middle."""
+    return not clip["provenance"].get(WINDOW)
 
 
 def clip_seed(provenance: dict[str, Any]) -> int:

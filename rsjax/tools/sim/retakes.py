@@ -12,7 +12,7 @@ from rsjax.data.codec import Record
 from rsjax.data.store import Store, open_store
 from rsjax.errors import UserError
 from rsjax.tools.sim.collect import Collection, Report, make_store
-from rsjax.tools.sim.episode import WINDOW, EpisodePlan, Replay, source_name
+from rsjax.tools.sim.episode import EpisodePlan, Replay, begins_episode, source_name
 from rsjax.tools.sim.unseen import UNITS
 
 FOLDER = "retakes"  # inside the store's directory, so that it moves with the store
@@ -41,7 +41,7 @@ def collect_retakes(clips: Store, split: str, numbers: Sequence[int], workers: i
     if config is None or source_name(config) != clips.manifest.get("source"):
         raise UserError(f"{clips.path}: these clips were not simulated, so there is no second take of them")
     records = [clips.source(split)[number] for number in numbers]
-    if any(record["provenance"].get(WINDOW) for record in records):
+    if not all(map(begins_episode, records)):
         raise UserError(
             f"{clips.path}, split {split}: some of its clips begin in the middle of an episode, where the simulator "
             f"cannot begin; score without second takes"

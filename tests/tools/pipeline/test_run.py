@@ -18,6 +18,7 @@ from rsjax.config import (
     sampling_settings,
     to_dict,
 )
+from rsjax.config.config_fields import with_values
 from rsjax.evaluation.metrics import fvd
 from rsjax.tools.pipeline import run as module
 from rsjax.tools.pipeline.run import STAGES, TRAINED, Run, RunError
@@ -86,6 +87,14 @@ def test_a_field_changes_the_keys_of_its_stage_and_of_all_after_it(field: str, v
 )
 def test_how_a_run_is_carried_out_changes_no_key(field: str, value: Any) -> None:
     assert keys(changed(field, value)) == keys(DEBUG)
+
+
+def test_with_an_early_stop_keys_know_what_validation_generates() -> None:
+    early = with_values(DEBUG, {"train.early_stop": "on", "tokenizer_train.early_stop": "on"})
+    changes = {"eval.clips": "tokenizer", "eval.batch_size": "world_model", "model.sample.steps": "world_model"}
+    for field, first in changes.items():
+        after = keys(with_values(early, {field: 1 if field == "eval.batch_size" else 3}))
+        assert next(stage for stage in STAGES if keys(early)[stage] != after[stage]) == first
 
 
 def test_a_model_without_tokens_has_no_tokenizer_stage_and_does_not_depend_on_its_settings() -> None:

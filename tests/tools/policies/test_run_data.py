@@ -1,16 +1,20 @@
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import numpy as np
 import pytest
 
 from rsjax.config import Config, presets, to_dict
+from rsjax.data.codec import Record
 from rsjax.errors import UserError
 from rsjax.files import write_json
+from rsjax.tools.policies.demos import is_demo
 from rsjax.tools.policies.judges.judge import HISTORY
 from rsjax.tools.policies.judges.trained_judge import JudgeNetwork, TrainedJudge
 from rsjax.tools.policies.run_data import RunData, replicates, training_of
+from rsjax.tools.sim.episode import WINDOW
 
 
 def run(path: Path, config: Config, trained: bool = True) -> RunData:
@@ -39,8 +43,27 @@ def test_runs_in_which_no_policy_can_act_are_named_before_any_training(tmp_path:
         UserError, match=r"small: frames of 64 pixels and actions of \d+ numbers, .*first has 64 and 28"
     ):
         small.check_world(first)
+    headless = run(tmp_path / "headless", config)
+    headless.check_world(first, first.run / "judge")
+    with pytest.raises(UserError) as refused:
+        headless.check_world(first, Path("head"))
+    assert "headless" in str(refused.value)
     with pytest.raises(UserError, match="new: its world model is not trained yet"):
         run(tmp_path / "new", config, trained=False).check_world(first)
+
+
+def test_episodes_start_and_demonstrations_begin_as_episodes_do(tmp_path: Path) -> None:
+    def clip(window: int, success: bool) -> Record:
+        frames = np.full((2, 4, 4, 3), window, np.uint8)
+        return {"rgb": frames, "depth": None, "provenance": {WINDOW: window}, "success": np.array([False, success])}
+
+    clips = [clip(7, True), clip(0, True), clip(0, False)]
+    data = run(tmp_path / "run", presets.debug())
+    vars(data)["clips"] = SimpleNamespace(source=lambda split: clips)
+    assert [(start.clip, start.rgb.max()) for start in data.first_frames(2)] == [(1, 0), (2, 0)]
+    assert [is_demo(each, "success", True) for each in clips] == [False, True, False]
+    assert [is_demo(each, "success", False) for each in clips] == [False, True, True]
+    assert all(is_demo(each, "all", True) for each in clips)
 
 
 def test_a_judge_of_frames_of_another_size_is_named(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from rsjax.config import ModelConfig
 from rsjax.config.fields import require_range
 from rsjax.data.state_labels import STATE
 from rsjax.errors import UserError
@@ -58,19 +59,26 @@ class HeadJudge:
         return all_successes(verdicts)
 
 
+def check_heads(model: ModelConfig, where: str) -> None:
+    """Raises :class:`UserError` if a model has no state heads.
+
+    Args:
+        where: names the model in the message.
+    """
+    if getattr(model, "state_heads", None) is None:
+        raise UserError(
+            f"{where}: has no state heads, which the judge {NAME!r} reads; train it with --model.state-heads on, or "
+            f"name another judge"
+        )
+
+
 def head_judge(trained: TrainedModel, run: Path | None = None) -> HeadJudge:
     """Returns the judge of a model's heads, with its validation if ``rsjax judge RUN --head`` made one.
 
     Raises:
         UserError: the model has no state heads, or the file of the validation is damaged.
     """
-    heads = getattr(trained.config.model, "state_heads", None)
-    if heads is None:
-        where = "the model" if run is None else str(run)
-        raise UserError(
-            f"{where}: has no state heads, which the judge {NAME!r} reads; train it with --model.state-heads on, or "
-            f"name another judge"
-        )
+    check_heads(trained.config.model, "the model" if run is None else str(run))
     if run is None or not (run / FOLDER / VALIDATION).exists():
         return HeadJudge()
     return HeadJudge(frames_in_a_row(run), _validation(run))

@@ -198,6 +198,8 @@ def adapted(
         start: the run whose weights training starts from; its tokenizer stays as it is.
     """
     config = data.config
+    if config.train.curriculum and number == 1:
+        note(f"{data.run}: was trained by a curriculum; the adaptation draws from its own clips and the new ones alone")
     own = len(data.clips.source("train"))
     counts = [len(open_store(place).source("train")) for place in tokens]
     components = [ComponentConfig(weight=1 - settings.share)]

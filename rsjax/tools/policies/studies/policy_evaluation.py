@@ -69,8 +69,9 @@ REPLAYS_HEAD = (
     "run", "policies", "in the model", "its actions in the simulator", "in the simulator", "by the outcome", "by acting"
 )  # fmt: skip
 REPLAYS = (
-    "The bias is the sum of two: the simulator ends otherwise under the same actions (by the outcome), and the policy "
-    "acts otherwise there (by acting). The actions of each episode in the model are replayed from its start."
+    "In episodes that start alike, the bias is the sum of two: the simulator ends otherwise under the same actions (by "
+    "the outcome), and the policy acts otherwise there (by acting). The actions of each episode in the model are "
+    "replayed from its start."
 )
 FIRST_TRAINING = "policy"
 REPLAYED = "replayed"  # in the folder of a policy's trials in a world model

@@ -24,7 +24,7 @@ from rsjax.evaluation.results import fingerprint
 from rsjax.files import disk_guard, read_json, write_atomically, write_json
 from rsjax.models.trained import TrainedModel
 from rsjax.tools.export.lerobot import LeRobotOptions, export_lerobot
-from rsjax.tools.policies.demos import Only, chooses, controls_of
+from rsjax.tools.policies.demos import Only, chooses, controls_of, is_demo
 from rsjax.tools.policies.judges.judge import SUCCESS, UNINTERPRETABLE, Judge, frames_of, judge_key, last_frames
 from rsjax.tools.policies.judges.validation import summary
 from rsjax.tools.policies.worlds.actions import ActionRange, check_takes_actions
@@ -229,7 +229,7 @@ def choose_clips(store: Store, options: Synthesis) -> list[int]:
     chosen: list[int] = []
     fps: float | None = None
     for number, clip in readable(source, order):
-        if not labelled or clip["success"][-1]:
+        if is_demo(clip, options.only, labelled):
             chosen.append(number)
             fps = fps or frame_rate(clip, store.manifest)
             if fps and not options.fps and not keeps_rate(clip, store.manifest, fps):

@@ -182,7 +182,7 @@ def _measure(claim: Claim, comparison: ArmComparison, arms: Mapping[str, ArmScor
     if test is None or inner_test is None:
         return replace(judged, reason="one seed says nothing about others")
     judged = replace(judged, test=test, difference=_wider(resampled, test), inner=_wider(inner, inner_test))
-    if success and not statistics.can_lose(np.stack(pair.b), -comparison.margin):
+    if success and not statistics.can_lose(distinct(pair.b), -comparison.margin):
         return replace(judged, reason="the other side succeeds too seldom for a loss of the margin to show")
     return judged
 
@@ -204,10 +204,15 @@ def _verdict(judged: Judged) -> Verdict:
 def _resampled(pair: PairedScores, level: float, statistic: Statistic, success: bool) -> Estimate:
     """Returns the difference with its interval over seeds and clips, or, for success rates, Newcombe's."""
     if success:
-        return statistics.share_difference(np.concatenate(pair.a), np.concatenate(pair.b), level)
+        return statistics.share_difference(distinct(pair.a), distinct(pair.b), level)
     if pair.own_clips:
         return statistics.nested_bootstrap(pair.a, pair.b, level=level, statistic=statistic)
     return statistics.paired_bootstrap(np.stack(pair.a), np.stack(pair.b), level=level, statistic=statistic)
+
+
+def distinct(rows: Rows) -> np.ndarray:
+    """Returns the trials of all seeds, those that seeds share once: an arm that no seed trains has the same in all."""
+    return np.concatenate(list({np.asarray(row).tobytes(): row for row in rows}.values()))
 
 
 def _paired(better: ArmScores, than: ArmScores, comparison: ArmComparison) -> PairedScores:

@@ -178,8 +178,8 @@ def test_every_search_begins_with_a_policys_way_and_leaves_it_for_a_clearly_bett
         seen.append(rows)
         return 1 + np.square(rows - wanted).sum((1, 2))
 
-    def planner(**settings: float) -> Planner:
-        config = replace(PlannerConfig(horizon=3, candidates=8, rounds=2, hold=2), **settings)
+    def planner(margin: float = 0.0) -> Planner:
+        config = PlannerConfig(horizon=3, candidates=8, rounds=2, hold=2, margin=margin)
         scale = np.array([0.1, 0.0, 0.1, 0.0])
         return Planner(energy, np.tile(LOW, 2), np.tile(HIGH, 2), config, lambda frames: plans, scale)
 

@@ -16,7 +16,7 @@ from rsjax.tools.studies.paper import result_files
 from rsjax.tools.studies.paper.arm_scores import ArmScores, ScoreRows, key_of_test_clips, rounded
 from rsjax.tools.studies.paper.claim import ArmComparison
 from rsjax.tools.studies.paper.claim_tables import claim_content, claim_tables
-from rsjax.tools.studies.paper.judge import Outcome, judge_claim
+from rsjax.tools.studies.paper.judge import Outcome, distinct, judge_claim
 from rsjax.tools.studies.paper.run import run_plan
 from rsjax.tools.studies.tables import as_markdown
 from tests.tools.studies.paper import toy
@@ -80,6 +80,11 @@ def test_a_planted_difference_is_found(gain: float, noise: float, verdict: str, 
     assert found.difference is not None and found.resampled is not None and found.test is not None
     low = min(found.resampled.low or 0, found.test.difference.low or 0)
     assert found.difference.low == low, "the interval that is shown decides"
+
+
+def test_trials_that_seeds_share_count_once() -> None:
+    rows = [np.array([1.0, 0.0]), np.array([0.0, 0.0]), np.array([1.0, 0.0])]
+    np.testing.assert_array_equal(distinct(rows), [1, 0, 0, 0])
 
 
 def test_seeds_of_one_arm_alone_have_no_pair() -> None:
