@@ -47,6 +47,6 @@ docs: setup  ## the documentation as a site, in site/; open site/index.html
 	@scripts/docs.sh "$(VENV)"
 	@NO_MKDOCS_2_WARNING=1 $(python) -m mkdocs build --strict --quiet $(ARGS)
 
-clean:  ## removes the environment and the caches; data and runs stay
-	@rm -rf "$(VENV)" build site rsjax.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
+clean:  ## removes the environment, the caches and what was built; data and runs stay
+	@rm -rf "$(VENV)" build dist site rsjax.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
 	@find rsjax experiments benchmarks scripts tests -name __pycache__ -prune -exec rm -rf {} +

@@ -55,7 +55,7 @@ class Video:
 
     Attributes:
         rgb: frames, 0–255, RGB order, upright.
-        depth: z-depth in metres; all NaN for a clip without depth. None: no clip has depth.
+        depth: z-depth in metres, NaN where it is unknown; all NaN for a clip without depth. None: no clip has depth.
         tasks: the robot's task in each clip, in words; None: unknown.
         state: a column for each of :data:`rsjax.data.state_labels.STATE`, NaN where unknown: of recorded clips the
             labels, of generated ones what the model's state heads read, with the probability of success. None: neither.
@@ -70,10 +70,10 @@ class Video:
 
     @property
     def has_depth(self) -> Bool[np.ndarray, " B"]:
-        """A mask of the clips that have depth."""
+        """A mask of the clips that have depth: it is known in some pixel of the first frame. NaN is unknown."""
         if self.depth is None:
             return np.zeros(len(self.rgb), bool)
-        return ~np.isnan(self.depth[:, :1]).any(axis=(1, 2, 3))
+        return ~np.isnan(self.depth[:, :1]).all(axis=(1, 2, 3))
 
     def __len__(self) -> int:
         """Returns the number of clips."""

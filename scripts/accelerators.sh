@@ -14,8 +14,12 @@ stop() {
     exit 2
 }
 
+# What the environment depends on; where it stands too, since an environment that was moved is broken.
 key() {
-    cat requirements-accelerators.txt scripts/accelerators.sh | sha256sum
+    {
+        echo "$venv"
+        cat requirements-accelerators.txt scripts/accelerators.sh
+    } | sha256sum
 }
 
 stamp=$venv/.rsjax-accelerators

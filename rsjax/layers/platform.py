@@ -80,7 +80,8 @@ def known_after(x: Float[Array, "..."], number: Any) -> Any:
         return number
 
     def late(x: Array, number: Array) -> Array:
-        return number + jnp.isnan(x.reshape(-1)[0])  # 0; for NaN the place does not matter
+        # 0; for NaN 1, which does not matter to that clip, but moves the place of all other clips of the batch too.
+        return number + jnp.isnan(x.reshape(-1)[0])
 
     return by_platform(late, lambda x, number: number, x, number)
 
@@ -197,7 +198,7 @@ def norm_linear(
 ) -> Float[Array, "B T S D"]:
     """Returns ``layers(x, norm, kernel)``, layer_norm(x)·kernel; GPUs do it by one kernel if x is bf16 and fits.
 
-    Gradients are those of ``layers``, which a backward pass computes again.
+    A program with a gradient runs ``layers`` instead, forward too: the kernel is for generation.
     """
     if x.dtype != jnp.bfloat16 or not gpu_norm_linear.fits(x.shape, kernel.shape[1]):
         return layers(x, norm, kernel)

@@ -86,12 +86,19 @@ class TrainedModel:
         """Generates the N videos that follow the frames of one clip under N action sequences.
 
         All candidates share their random draws, so they differ only by their actions. Arguments and errors are those of
-        :meth:`generate`.
+        :meth:`generate`. In rows 1 to P - 1, which led into the frames, all candidates have the same actions.
         """
         prompt, single = self._prompt(frames, depth, task)
         if not single:
             raise ShapeError(f"frames have shape {np.shape(frames)}; a plan starts from one clip, (P, H, W, 3)")
-        return self.model.plan(self.params, self.assets, prompt, self._actions(actions, prompt, ("N",)))
+        candidates = self._actions(actions, prompt, ("N",))
+        past = prompt.rgb.shape[1]
+        if np.any(candidates[:, 1:past] != candidates[:1, 1:past]):
+            raise ShapeError(
+                f"actions differ in rows before {past}, which led into the {past} frames; expected the same rows 1 to "
+                f"{past - 1} in all candidates"
+            )
+        return self.model.plan(self.params, self.assets, prompt, candidates)
 
     def encode(
         self, frames: UInt8[np.ndarray, "*B T H W 3"], depth: Float[np.ndarray, "*B T H W"] | None = None

@@ -110,16 +110,17 @@ class Codec:
         if method == "decode":
             side *= self.config.downsampling
         most = images_per_pass(side)
+        one_program = passes_at_once() > 1  # for any number of images, of which it computes those there are
 
         def apply(chunk: np.ndarray) -> ArrayLike:
-            if passes_at_once() > 1:  # one program serves any number of images
+            if one_program:
                 rows = np.zeros((most, *chunk.shape[1:]), chunk.dtype)
                 rows[: len(chunk)] = chunk
                 return _run(self.config, method, None, self.params, rows, np.int32(len(chunk)))[: len(chunk)]
             x = divide(chunk, self.params)
             return _run(self.config, method, mesh_of(x), self.params, x)
 
-        return in_chunks(apply, images, axes, most)
+        return in_chunks(apply, images, axes, most, pad=not one_program)
 
 
 def images_per_pass(side: int) -> int:
@@ -130,12 +131,15 @@ def images_per_pass(side: int) -> int:
     return max(1, pixels // side**2)
 
 
-def in_chunks(apply: Callable[[np.ndarray], ArrayLike], items: np.ndarray, item_axes: int, most: int) -> np.ndarray:
+def in_chunks(
+    apply: Callable[[np.ndarray], ArrayLike], items: np.ndarray, item_axes: int, most: int, pad: bool = True
+) -> np.ndarray:
     """Applies a function to all items, in passes of at most ``most`` items.
 
     Args:
         apply: the function; its result for an item must not depend on the other items.
         items: with any leading axes before the ``item_axes`` of an item.
+        pad: whether the last pass gets as many items as the others, by repeats, so that it needs no other program.
     """
     lead = items.shape[:-item_axes]
     item = items.shape[-item_axes:]
@@ -145,6 +149,8 @@ def in_chunks(apply: Callable[[np.ndarray], ArrayLike], items: np.ndarray, item_
 
     def run(start: int) -> np.ndarray:
         chunk = flat[start : start + size]
+        if not pad:
+            return np.asarray(apply(chunk))
         padded = np.concatenate([chunk, np.repeat(chunk[-1:], size - len(chunk), axis=0)])
         return np.asarray(apply(padded))[: len(chunk)]
 

@@ -66,4 +66,5 @@ def validation_loss(model: Trainable[B], params: Params, batches: Iterable[B]) -
 @partial(jax.jit, static_argnums=0)
 def _terms(model: Trainable[Any], params: Params, batch: Any, draw: Int[Array, ""]) -> dict[str, Term]:
     key = jax.random.fold_in(jax.random.key(_SEED), draw)
-    return model.loss_terms(params, batch, key, StepContext(jax.numpy.int32(0), None, None))
+    before_any = jax.numpy.int32(-1)  # so that self-conditioning is off, and losses of different settings compare
+    return model.loss_terms(params, batch, key, StepContext(before_any, None, None))

@@ -9,12 +9,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.sharding import AxisType
 
 import rsjax
 from rsjax.config import Config, ConfigError, LoopConfig, presets
 from rsjax.config.config_fields import with_values
 from rsjax.errors import UserError
 from rsjax.layers.cpu import convolution
+from rsjax.layers.partition import FSDP
 from rsjax.models.base import create_autoencoder, create_model
 from rsjax.tools.describe import count, describe
 from rsjax.tools.pipeline import stages
@@ -161,6 +163,22 @@ def test_a_step_does_not_depend_on_how_its_batch_is_split(family: str) -> None:
         for name, (value, weight) in whole.items():
             np.testing.assert_allclose(summed[name], (value, weight), rtol=2e-4, atol=1e-5, err_msg=name)
         assert np.isfinite(combine(whole, model.loss_weights)[0])
+
+
+@every_family
+@pytest.mark.parametrize("remat", ["none", "blocks"])
+def test_blocks_gather_their_parameters_one_after_another(family: str, remat: str) -> None:
+    """Which the train step leaves to them, where a mesh splits the parameters."""
+    config = with_values(families.FAMILIES[family](), {"model.remat": remat})
+    *_, (model, shapes, batch) = families.batches_of(config)
+    assert config.model.scanned > 0
+    mesh = jax.make_mesh((1,), (FSDP,), axis_types=(AxisType.Auto,))
+    with jax.set_mesh(mesh):
+        program = jax.make_jaxpr(model.loss_terms)(
+            shapes, batch, jax.random.key(0), StepContext(jnp.int32(0), None, None)
+        )
+    gathered = str(program).count("sharding_constraint[")
+    assert gathered >= len(jax.tree.leaves(shapes["blocks"]))
 
 
 @pytest.mark.usefixtures("bf16_units")

@@ -53,6 +53,15 @@ def test_a_version_that_cannot_be_next_is_refused(tree: Path, wrong: str) -> Non
     assert "three numbers" in str(error.value)
 
 
+def test_a_wheel_that_was_built_is_no_change(tree: Path) -> None:
+    shutil.copy(release.ROOT / ".gitignore", tree)
+    subprocess.run(["git", "init", "-q"], cwd=tree, check=True)
+    (tree / "dist").mkdir()
+    (tree / "dist" / "rsjax.whl").touch()
+    status = subprocess.run(["git", "status", "--porcelain"], cwd=tree, check=True, capture_output=True, text=True)
+    assert "dist" not in status.stdout
+
+
 def test_uncommitted_changes_stop_a_release(tree: Path) -> None:
     subprocess.run(["git", "init", "-q"], cwd=tree, check=True)
     with pytest.raises(SystemExit) as error:

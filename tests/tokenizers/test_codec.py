@@ -11,7 +11,7 @@ from rsjax.data.depth_color import depth_to_color
 from rsjax.data.normalization import Normalization
 from rsjax.errors import UserError
 from rsjax.tokenizers import codec as module
-from rsjax.tokenizers.codec import Codec
+from rsjax.tokenizers.codec import Codec, in_chunks
 from rsjax.tokenizers.magvit2 import Tokenizer
 from tests.tools.pipeline import toy
 
@@ -23,6 +23,11 @@ NORMALIZATION = Normalization((0.0,), (1.0,), NEAR_FAR)
 @pytest.fixture(scope="module")
 def codec() -> Codec:
     return Codec(CONFIG, toy.tokenizer_params(), NORMALIZATION)
+
+
+def replace_network(run: Callable[..., np.ndarray], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lets a function stand in for the program that encodes or decodes a pass."""
+    monkeypatch.setattr(module, "_run", run)
 
 
 @pytest.mark.parametrize("chunk", [1, 4, 7])
@@ -48,7 +53,7 @@ def test_depth_goes_through_its_colours_and_comes_back_in_metres(codec: Codec, m
     np.testing.assert_array_equal(tokens, codec.encode_rgb(colors))
     monkeypatch.setattr(module, "passes_at_once", lambda: 1)
     # With a tokenizer that keeps everything, metres are right to half of one of the map's 766 levels.
-    monkeypatch.setattr(module, "_run", lambda config, method, mesh, params, x: np.resize(colors, (len(x), 64, 64, 3)))
+    replace_network(lambda config, method, mesh, params, x: np.resize(colors, (len(x), 64, 64, 3)), monkeypatch)
     metres = codec.decode_depth(tokens)
     assert metres.shape == depth.shape
     level = (1 / NEAR_FAR[0] - 1 / NEAR_FAR[1]) / 765
@@ -84,6 +89,41 @@ def test_a_videos_depth_is_that_of_the_clips_that_have_it(codec: Codec) -> None:
     np.testing.assert_array_equal(again.depth[0], codec.decode_depth(tokens["depth"][0]))
     assert codec.encode(Video(rgb)).keys() == {"rgb"} and codec.encode(video[1:]).keys() == {"rgb"}
     assert codec.decode(tokens, np.zeros(2, bool)).depth is None
+
+
+def test_a_clip_has_depth_where_any_pixel_of_its_first_frame_is_known(codec: Codec) -> None:
+    depth = np.ones((3, 2, 64, 64), np.float32)
+    depth[0, 0, 5, 7] = np.nan
+    depth[1, 0] = np.nan
+    video = Video(np.zeros((*depth.shape, 3), np.uint8), depth)
+    assert video.has_depth.tolist() == [True, False, True]
+    zero = np.nan_to_num(depth[0], nan=0.0)
+    np.testing.assert_array_equal(codec.encode(video)["depth"][0], codec.encode_depth(zero))
+
+
+@pytest.mark.parametrize(("pad", "sizes"), [(True, [16, 16]), (False, [1, 16])])
+def test_the_last_pass_is_padded_only_if_asked_for(pad: bool, sizes: list[int]) -> None:
+    passes = []
+
+    def negative(items: np.ndarray) -> np.ndarray:
+        passes.append(len(items))
+        return -items
+
+    items = np.arange(17.0)[:, None]
+    np.testing.assert_array_equal(in_chunks(negative, items, 1, 16, pad), -items)
+    assert sorted(passes) == sizes
+
+
+def test_a_cpu_computes_no_image_twice(codec: Codec, monkeypatch: pytest.MonkeyPatch) -> None:
+    counts = []
+
+    def apply(config: Any, method: str, mesh: Any, params: Any, x: np.ndarray, count: np.ndarray) -> np.ndarray:
+        counts.append(int(count))
+        return np.zeros((len(x), 8, 8), np.int32)
+
+    replace_network(apply, monkeypatch)
+    assert codec.encode_rgb(np.zeros((17, 64, 64, 3), np.uint8)).shape == (17, 8, 8)
+    assert sum(counts) == 17
 
 
 def test_one_program_serves_any_number_of_images(codec: Codec) -> None:

@@ -159,4 +159,16 @@ def test_the_launch_files_use_options_of_the_command() -> None:
     assert (config.runtime.sharding, config.runtime.fsdp) == ("mesh", 8)
     assert (options.coordinator, options.processes, options.process_id) == ("rsjax-train-0.rsjax:8476", 2, 1)
     assert job["completions"] == job["parallelism"] == options.processes
-    subprocess.run(["bash", "-n", ROOT / "launch/slurm.sbatch"], check=True)
+
+
+@pytest.mark.parametrize(
+    ("status", "restarts", "queued"),
+    [(0, 0, False), (75, 99, True), (1, 0, False), (2, 0, False), (134, 19, True), (134, 20, False)],
+)
+def test_the_job_is_queued_again_where_that_helps(tmp_path: Path, status: int, restarts: int, queued: bool) -> None:
+    for name, act in (("srun", f"exit {status}"), ("scontrol", f"touch {tmp_path}/queued")):
+        (tmp_path / name).write_text(f"#!/bin/bash\n{act}\n")
+        (tmp_path / name).chmod(0o755)
+    environ = {"PATH": f"{tmp_path}:/usr/bin:/bin", "SLURM_RESTART_COUNT": str(restarts), "SLURM_JOB_ID": "1"}
+    job = subprocess.run(["bash", ROOT / "launch/slurm.sbatch", "experiments.train", "debug"], env=environ)
+    assert (job.returncode, (tmp_path / "queued").exists()) == (status, queued)

@@ -16,6 +16,7 @@ from jaxtyping import Array, Float, Float32, Int, Key
 
 from rsjax.config.data import ClipShape
 from rsjax.layers.dense import Dense
+from rsjax.layers.partition import gathers
 from rsjax.layers.platform import attend_cells
 from rsjax.models.cogvideox.config import CogVideoXConfig, latent_frames
 from rsjax.models.diffusion.layers import PERIOD, TimeEmbedding, grid_positions, positions
@@ -185,9 +186,9 @@ class Transformer(nn.Module):
         if cfg.learned_positions:
             x = x + self.param("learned_positions", ZEROS, x.shape[1:])
         time = TimeEmbedding(cfg.time_width, cfg.width, name="time")(t)
-        block: Any = CogVideoXBlock
+        block = gathers(CogVideoXBlock)
         if cfg.remat == "blocks":
-            block = nn.remat(CogVideoXBlock, prevent_cse=cfg.unroll > 1)
+            block = nn.remat(block, prevent_cse=cfg.unroll > 1)
         scan = nn.scan(
             block,
             variable_axes={"params": 0},

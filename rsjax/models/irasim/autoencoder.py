@@ -205,7 +205,8 @@ class KLCodec:
     def _colors(self, depth: Float[np.ndarray, "B T H W"]) -> UInt8[np.ndarray, "B T H W 3"]:
         assert self.config.depth != "none"
         near_far = self.normalization.require_depth_range()
-        return depth_to_color(depth, *near_far, self.config.depth).astype(np.uint8)
+        known = np.nan_to_num(depth, nan=0.0)  # NaN and 0 both say that it is unknown
+        return depth_to_color(known, *near_far, self.config.depth).astype(np.uint8)
 
     def _posterior(self, images: UInt8[np.ndarray, "B T H W 3"]) -> dict[str, Float[np.ndarray, "B T h w z"]]:
         run = partial(self._run, distributions.encode_pixels, encode)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 from rsjax.config.data import ClipShape
-from rsjax.config.fields import loss_weights, require, require_range, runtime, sampling
+from rsjax.config.fields import ConfigError, loss_weights, require, require_range, runtime, sampling
 from rsjax.config.model import ModelConfig, register_family
 from rsjax.config.tokenizer import TokenizerConfig
 from rsjax.models.diffusion.config import DenoiseConfig, NoiseConfig, check_grid
@@ -82,7 +82,10 @@ class KLConfig:
             "model.autoencoder.patch_size and local_codes belong to the network magvit2; "
             "leave them at 1 and False, or set model.autoencoder.network",
         )
-        self.convolutions  # noqa: B018 - checks the other fields
+        try:
+            self.convolutions  # noqa: B018 - checks the other fields
+        except ConfigError as error:
+            raise ConfigError(str(error).replace("tokenizer.", "model.autoencoder.")) from error
 
     @property
     def convolutions(self) -> TokenizerConfig:

@@ -6,7 +6,6 @@ action inputs.
 
 from dataclasses import dataclass, fields
 from functools import partial
-from typing import Any
 
 import flax.linen as nn
 import jax.numpy as jnp
@@ -15,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from rsjax.config import Config
 from rsjax.layers.attention import attend
 from rsjax.layers.dense import Dense
+from rsjax.layers.partition import gathers
 from rsjax.layers.platform import attend_cells
 from rsjax.models.diffusion.layers import TIME_CHANNELS, TimeEmbedding, grid_positions, modulate, positions
 from rsjax.models.irasim.config import DiTConfig, IRASimConfig
@@ -158,9 +158,9 @@ class DiT(nn.Module):
             plain = acted
         if cfg.conditioning == "video" or cfg.final_frame_ada:
             last = acted
-        pair: Any = Pair
+        pair = gathers(Pair)
         if cfg.remat == "blocks":
-            pair = nn.remat(Pair, prevent_cse=cfg.unroll > 1)
+            pair = nn.remat(pair, prevent_cse=cfg.unroll > 1)
         pairs = cfg.blocks // 2
         scan = nn.scan(
             pair,

@@ -103,10 +103,11 @@ class IRASim(WorldModel[Batch]):
 
         def encode(clip: Record) -> Record:
             depth = clip["depth"]
-            latents = codec.encode(Video(clip["rgb"][None], None if depth is None else depth[None]))
+            video = Video(clip["rgb"][None], None if depth is None else depth[None])
+            latents = codec.encode(video)
             record = {name: x[0].astype(np.float16) for name, x in latents.items()} | described(clip)
             if self.config.uses_depth:
-                record["has_depth"] = depth is not None
+                record["has_depth"] = bool(video.has_depth[0])
             return record
 
         size = self.clips.image_size

@@ -31,7 +31,10 @@ class ConditionalVQConfig:
     def __post_init__(self) -> None:
         sizes = ("context_frames", "patch_size", "res_blocks", "norm_groups", "latent", "codes", "future_patch")
         require_range(self, "model.autoencoder", 1, float("inf"), *sizes, "attention_size", "heads")
-        require_range(self, "model.autoencoder", 0, 1, "dropout")
+        require(
+            0 <= self.dropout < 1,
+            f"model.autoencoder.dropout is {self.dropout}; it is a share, at least 0 and below 1",
+        )
         require(
             bool(self.widths) and all(w > 0 and w % self.norm_groups == 0 == w % self.heads for w in self.widths),
             f"model.autoencoder.widths are {self.widths}; give one for each level, divisible by norm_groups "
@@ -105,7 +108,10 @@ class IVideoGPTConfig(ModelConfig):
 
     def __post_init__(self) -> None:
         require_range(self, "model", 1, float("inf"), "width", "blocks", "heads", "mlp_width", "positions", "unroll")
-        require_range(self, "model", 0, 1, "dropout")
+        require(
+            0 <= self.dropout < 1,
+            f"model.dropout is {self.dropout}; it is a share, at least 0 and below 1",
+        )
         require(
             self.width % (2 * self.heads) == 0,
             f"model.width {self.width} is not divisible by 2 × model.heads ({self.heads}), whose channels rotate in "

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, Int, Key
 from rsjax.config import ClipShape
 from rsjax.layers.attention import KeyValues, attend_parts, rotate
 from rsjax.layers.dense import Dense
+from rsjax.layers.partition import gathers
 from rsjax.layers.platform import attend_cells, put_frames
 from rsjax.layers.unstacked_params import stack_params
 from rsjax.models.ivideogpt.config import IVideoGPTConfig
@@ -147,9 +148,9 @@ class LLaMA(nn.Module):
             added = nn.Dense(cfg.width, kernel_init=zeros, bias_init=zeros, name="action_linear")(actions)
             frame, place = jnp.divmod(first + jnp.arange(tokens.shape[1]) - layout.first_slot, layout.per_frame)
             x = x + jnp.where(((frame >= 0) & (place == 0))[:, None], added[:, jnp.maximum(frame, 0)], 0.0)
-        block: Any = LlamaBlock
+        block = gathers(LlamaBlock)
         if cfg.remat == "blocks":
-            block = nn.remat(LlamaBlock, prevent_cse=cfg.unroll > 1)
+            block = nn.remat(block, prevent_cse=cfg.unroll > 1)
         blocks = nn.scan(
             block,
             variable_axes={"params": 0},

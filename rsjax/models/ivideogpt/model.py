@@ -133,7 +133,7 @@ class IVideoGPT(WorldModel[dict[str, Array]]):
         return codec.decode(codec.encode(video))
 
     def pretrained_shapes(self, directory: Path) -> Params:
-        """Returns the shapes of a saved LLaMA, with or without actions.
+        """Returns the shapes of a saved LLaMA, with or without actions; a model without actions may start from either.
 
         Raises:
             UserError: the weights are missing or of another network; the message names the differing fields.
@@ -146,7 +146,7 @@ class IVideoGPT(WorldModel[dict[str, Array]]):
             raise UserError(f"{directory}: knows {codes} codes, this tokenizer has {own}; set model.autoencoder.codes")
         arch = self.architecture
         actions = saved_inputs(directory).action_dim * (1 + saved.integrate_actions)
-        if saved.use_actions and actions != arch.action_inputs:
+        if saved.use_actions and arch.action_inputs and actions != arch.action_inputs:
             raise UserError(
                 f"{directory}: its model reads actions of {actions} numbers, this one of {arch.action_inputs}; only a "
                 f"model without actions fits any"
@@ -155,7 +155,10 @@ class IVideoGPT(WorldModel[dict[str, Array]]):
         return jax.eval_shape(LLaMA(like).init_params, jax.random.key(0))
 
     def start(self, fresh: Params, saved: Params, directory: Path) -> Params:
-        """Returns the saved parameters; if they lack the layer of actions, the fresh one, which is zero, is added."""
+        """Returns the saved parameters without a layer of actions that this model lacks.
+
+        If they lack that layer, the fresh one, which is zero, is added.
+        """
         return {name: saved.get(name, x) for name, x in fresh.items()}
 
     def cache_shapes(self, frames: int) -> Any:

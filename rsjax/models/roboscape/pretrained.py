@@ -28,7 +28,8 @@ JOINING: tuple[str, ...] = ("blocks/depth_to_rgb/", "action_encoder/", "action_e
 ADAPTIVE = "/action_norms/"
 HEAD_JOINING = ("depth_embed/", "depth_previous_embed/")
 SECOND_JOINING = (f"{SECOND}_embed/", f"{SECOND}_previous_embed/")
-OPTIONAL = {"motion_head", "state_heads"}  # parameters that are left out where this model lacks them
+# Parameters that are left out where this model lacks them.
+OPTIONAL = {"motion_head", "state_heads", "null_action", "depth_null_action"}
 # Fields that may differ.
 FREE = {"action_encoder", "action_inputs", "motion_head", "state_heads", "one_start", "departures"} | {
     "compute_dtype",
@@ -91,7 +92,7 @@ def start(fresh: Params, saved: Params, directory: Path) -> Params:
     What joins the RGB branch begins at zero: the depth → RGB projection or, with a depth head, the embeddings of depth,
     those of a second view, and the action encoder's last layer, or what adaptive norms read from it. So RGB logits are
     at first those of the saved model. A saved action encoder is kept; it reads actions normalised for the new data.
-    Saved motion or state heads that this model lacks are left out.
+    Saved motion heads, state heads or null actions that this model lacks are left out.
 
     Raises:
         UserError: this model lacks a saved array, or has it in another shape.

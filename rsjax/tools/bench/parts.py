@@ -82,7 +82,7 @@ def train(config: Config, batch: int, budget: float) -> Numbers:
     model = create_model(config)
     loop = config.loop("world_model")
     accumulate = math.gcd(loop.accumulate, batch)  # a smaller batch has fewer parts
-    loop = dataclasses.replace(loop, batch_size=batch, accumulate=accumulate, sharding="jit")
+    loop = dataclasses.replace(loop, batch_size=batch, accumulate=accumulate, sharding="jit", fsdp=1)
     state = jax.jit(lambda: create_state(model, loop))()
     clips = inputs.batch(model, config, batch)
     began = time.perf_counter()

@@ -34,7 +34,7 @@ class Options:
     runs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN …")] = ()
     """Run directories, made by rsjax train; saved models, on the clips in them; or tiny or multitask, the package's."""
     protocol: str = "paper"
-    """paper, 1xgpt, ivideogpt-bair, horizon48, unseen, or run: that of the run's own configuration."""
+    """paper, 1xgpt, ivideogpt-bair, horizon48, unseen, contacts, or run: that of the run's own configuration."""
     data: Path | None = None
     """A store with the clips to score; default: the run's own."""
     split: tuple[str, ...] = ()

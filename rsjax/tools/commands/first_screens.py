@@ -60,13 +60,13 @@ FIRST_SCREENS = {
         "open {run}/report.html; rsjax play {run} drives the model; docs/finetune.md says how to make it better",
     ),
     "doctor": FirstScreen(
-        "rsjax doctor lerobot /data/pusht --fix good.json",
+        "rsjax doctor lerobot /data/pusht --option kind=absolute --fix good.json",
         "the terminal: a line for each finding; --fix FILE writes the list of good episodes",
         ("fix", "option", "ignore", "frames", "workers"),
         "rsjax ingest SOURCE PATH --out STORE --selection FILE, with the file of --fix",
     ),
     "ingest": FirstScreen(
-        "rsjax ingest lerobot /data/pusht --out data/pusht",
+        "rsjax ingest lerobot /data/pusht --option kind=absolute --out data/pusht",
         "the store --out, data/SOURCE by default; what was left out is listed in STORE.work",
         ("out", "image-size", "selection", "camera", "workers"),
         "rsjax inspect STORE shows it; rsjax train tiny --store STORE --run-dir runs/mine trains on it",
@@ -106,6 +106,13 @@ FIRST_SCREENS = {
         "OUT, a LeRobotDataset",
         ("version", "split", "state", "codec", "fps"),
         "train on it with LeRobot or openpi (docs/lerobot.md)",
+    ),
+    "export libero": FirstScreen(
+        "rsjax export libero libero-like --demos 40",
+        "OUT, a LeRobotDataset with the keys of openpi's data of LIBERO",
+        ("demos", "seed", "size", "version", "codec"),
+        "train on it with openpi (docs/lerobot.md)",
+        "40 demonstrations take about 13 minutes of processor time",
     ),
     "evaluate": FirstScreen(
         "rsjax evaluate runs/tiny --protocol horizon48",

@@ -32,11 +32,6 @@ def make_clips(recordings: Recordings, cutting: Cutting, source: StartingModel, 
     if not recordings.source:
         return open_store(recordings.path)
     options = ingest_options(recordings, cutting, source.image_size, source.architecture.frames, out / CLIPS)
-    windows = options.windows
-    note(
-        f"clips of {windows.frames} frames at {windows.rate:.3g} Hz, {options.image_size} pixels a side; actions "
-        f"between two frames: {options.actions.compose} (rsjax ingest has more options, and --data takes its store)"
-    )
     plan = make_plan(recordings.source, recordings.path, options)
     listed = list_episodes(plan)
     with Progress("ingest", count_steps(plan, listed[0]), "steps", settle=2 * len(plan.steps)) as progress:

@@ -150,9 +150,9 @@ def reversible(store: Store) -> BackwardsConfig | None:
     states = []
     dimensions = described_kinds(store.manifest.get("action_dimensions") or [])
     for number, (kind, *more) in enumerate(dimensions):
-        if kind in ("held", "absolute") and more in ([], ["of a quaternion"]):
+        if kind in ("held", "absolute") and more in ([], ["of a quaternion"], ["an angle"]):
             states.append(number)
-        elif (kind, *more) != ("delta",):
+        elif kind != "delta" or more not in ([], ["an angle"]):
             return None
     if not dimensions:
         return None

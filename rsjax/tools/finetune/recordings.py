@@ -97,8 +97,9 @@ def ingest_options(
     """Returns options of an ingest that suit the recordings.
 
     Clips have every n-th frame, so that the rate is 5 Hz or a little more or less, and as many frames as the model has
-    positions, or fewer if episodes are short. Where a data set does not say whether actions add up, a clip's action is
-    the recorded ones of its interval, one after another.
+    positions, or fewer if episodes are short. If that is every frame, times do not count, since a recording that is a
+    little slower than others lacks frames for their rate. Where a data set does not say whether actions add up, a
+    clip's action is the recorded ones of its interval, one after another.
 
     Args:
         image_size: pixels a side.
@@ -111,8 +112,12 @@ def ingest_options(
     refs = list(source.episodes())
     episodes, reason = readable_episodes(source, refs[:LOOKED_AT])
     require(bool(episodes), f"{recordings.path}: no episode can be read ({reason})")
-    fps = float(np.median([episode.fps for episode in episodes]))
+    recorded = [episode.fps for episode in episodes]
+    fps = float(np.median(recorded))
     every = max(1, round(fps / (cutting.rate or RATE)))
+    rate = fps / every
+    if every == 1 and max(recorded) < 1.5 * fps:
+        rate = 0.0  # every frame
     lengths = sorted(len(episode.timestamps) // every for episode in episodes)
     short = lengths[len(lengths) // 4]
     frames = cutting.frames or min(most_frames, int(LENGTH_SHARE * short))
@@ -130,10 +135,16 @@ def ingest_options(
         measured = measure_delay(readable_episodes(source, training[:LOOKED_AT])[0], cutting.camera, every)
         note(str(measured))
         delay = measured.frames
+    note(
+        f"clips of {frames} frames at {fps / every:.3g} Hz, {image_size} pixels a side; actions between two frames: "
+        f"{compose} (rsjax ingest has more options, and --data takes its store)"
+    )
+    if compose == "stack":
+        note("actions are not combined: say --option kind=absolute, or kind=delta and 'held=[…]', to combine them")
     return IngestOptions(
         out=out,
         option=cutting.option,
-        windows=WindowConfig(frames=frames, rate=fps / every, hop=max(1, round(total / MOST_CLIPS))),
+        windows=WindowConfig(frames=frames, rate=rate, hop=max(1, round(total / MOST_CLIPS))),
         actions=ActionConfig(offset=delay, compose=compose),
         image_size=image_size,
         camera=cutting.camera,

@@ -38,24 +38,24 @@ class ActionLayout:
         held: dimensions whose command stays in force until the next one, such as open or closed for a gripper, whatever
             ``kind`` is. Differences of them are never taken, and of several commands the last one counts.
         unclear: dimensions that cannot be steps, each with the reason; empty if the data set declares what they are.
+        angles: dimensions that are angles in radians, where π and -π are the same; quaternions are none.
     """
 
     kind: Kind | Literal["undeclared"] = "delta"
     quaternions: tuple[int, ...] = ()
     held: tuple[int, ...] = ()
     unclear: tuple[str, ...] = ()
+    angles: tuple[int, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
-        """Returns the fields, JSON-ready; ``unclear`` only if it is not empty."""
+        """Returns the fields, JSON-ready; ``unclear`` and ``angles`` only if they are not empty."""
         values = {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(self).items()}
-        if self.unclear:
-            return values
-        return {name: value for name, value in values.items() if name != "unclear"}
+        return {name: value for name, value in values.items() if value or name not in ("unclear", "angles")}
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> "ActionLayout":
         """Inverts :meth:`to_json`; missing fields get their defaults."""
-        dims = (tuple(values.get(name, ())) for name in ("quaternions", "held", "unclear"))
+        dims = (tuple(values.get(name, ())) for name in ("quaternions", "held", "unclear", "angles"))
         return cls(values.get("kind", "delta"), *dims)
 
 
@@ -89,7 +89,7 @@ def check_layout(layout: ActionLayout, width: int, where: Path | str) -> None:
         where: what the message names.
     """
     ends = [dim for first in layout.quaternions for dim in (first, first + 3)]
-    for name, dims in (("held", layout.held), ("quaternions", ends)):
+    for name, dims in (("held", layout.held), ("quaternions", ends), ("angles", layout.angles)):
         for wrong in (dim for dim in dims if not 0 <= dim < width):
             problem = f"{name} names dimension {wrong}, but actions have {width} (from 0 on)"
             raise EpisodeError.at(where, problem, f"mend the option {name}")
@@ -119,18 +119,17 @@ def check_declared(layout: ActionLayout, skipped: int, config: ActionConfig) -> 
 
 
 def align_actions(rows: Float[np.ndarray, "N A"], after: bool = False) -> Float32[np.ndarray, "N A"]:
-    """Aligns each action with the frame into which it led; row 0 becomes zeros.
+    """Aligns each action with the frame into which it led.
 
     Args:
         rows: an action for each frame.
         after: whether each frame was recorded after the action of its row, so that rows stay where they are. Otherwise
-            row t leads into frame t+1, and the last row is dropped.
+            row t leads into frame t+1, row 0 becomes zeros, and the last row is dropped.
     """
-    aligned = np.zeros(rows.shape, np.float32)
     if after:
-        aligned[1:] = rows[1:]
-    else:
-        aligned[1:] = rows[:-1]
+        return rows.astype(np.float32)
+    aligned = np.zeros(rows.shape, np.float32)
+    aligned[1:] = rows[:-1]
     return aligned
 
 
@@ -140,7 +139,7 @@ def sampled_actions(
     """Returns the action that led to each of these frames from the previous one in ``frames``; row 0 is zeros.
 
     Args:
-        actions: an episode's actions; row t led into frame t, row 0 has no meaning.
+        actions: an episode's actions; row t led into frame t; row 0 is zeros if it is unknown.
         frames: numbers of the sampled frames, increasing, each below N.
         config: how rows are combined.
         layout: layout of ``actions``.
@@ -182,9 +181,15 @@ def continuous_signs(quaternions: Float[np.ndarray, "N 4"]) -> Float[np.ndarray,
 
 
 def _shifted(rows: Float64[np.ndarray, "N A"], offset: int, layout: ActionLayout) -> Float64[np.ndarray, "N A"]:
-    """Moves row t - offset to row t. Beyond the ends, absolute and held values repeat and deltas mean no motion."""
+    """Moves row t - offset to row t. Beyond the ends, absolute and held values repeat and deltas mean no motion.
+
+    The rows begin with row 1 if row 0 is zeros, which stand for an unknown action.
+    """
+    first = 0
+    if not rows[0].any():
+        first = min(1, len(rows) - 1)
     wanted = np.arange(len(rows)) - offset
-    nearest = np.clip(wanted, min(1, len(rows) - 1), len(rows) - 1)
+    nearest = np.clip(wanted, first, len(rows) - 1)
     shifted = rows[nearest]
     if layout.kind == "delta":
         still = np.zeros(rows.shape[1])
@@ -195,12 +200,17 @@ def _shifted(rows: Float64[np.ndarray, "N A"], offset: int, layout: ActionLayout
 
 
 def _differences(rows: Float64[np.ndarray, "N A"], layout: ActionLayout) -> Float64[np.ndarray, "N A"]:
-    """Turns absolute rows into steps from the previous row; quaternions become q₋₁⁻¹ q, in the hand's own frame."""
+    """Turns absolute rows into steps from the previous row.
+
+    Quaternions become q₋₁⁻¹ q, in the hand's own frame. Angles take the shorter way, across π if need be.
+    """
     steps = np.diff(rows, axis=0, prepend=rows[:1])
     before = np.concatenate([rows[:1], rows[:-1]])
     for first in layout.quaternions:
         part = slice(first, first + 4)
         steps[:, part] = _shorter_way(_product(_unit(before[:, part]) * [-1.0, -1.0, -1.0, 1.0], _unit(rows[:, part])))
+    for dimension in layout.angles:
+        steps[:, dimension] = (steps[:, dimension] + np.pi) % (2 * np.pi) - np.pi
     for dimension in layout.held:
         steps[:, dimension] = rows[:, dimension]
     return steps
@@ -264,10 +274,11 @@ def described_layout(lines: Sequence[str]) -> ActionLayout | None:
     if not moving <= {"absolute", "delta"} or len(moving) > 1:
         return None
     held = tuple(number for number, words in enumerate(kinds) if words[0] == "held")
+    angles = tuple(number for number, words in enumerate(kinds) if "an angle" in words)
     kind: Kind = "absolute"
     if "delta" in moving:
         kind = "delta"
-    return ActionLayout(kind, tuple(turned[::4]), held)
+    return ActionLayout(kind, tuple(turned[::4]), held, angles=angles)
 
 
 def described_kinds(lines: Sequence[str]) -> list[list[str]]:
@@ -288,6 +299,7 @@ def layout_of(
     kind: Kind | None,
     held: Sequence[int] | None,
     quaternions: Sequence[int] = (),
+    angles: Sequence[int] = (),
     names: Sequence[str] = (),
     states: Float[np.ndarray, "N S"] | None = None,
 ) -> ActionLayout:
@@ -298,6 +310,7 @@ def layout_of(
         kind: as in :class:`rsjax.tools.ingest.actions.ActionLayout`; None: not declared.
         held: likewise; None: not declared. If it is declared, no dimension is questioned.
         quaternions: likewise.
+        angles: likewise.
         names: names of the dimensions.
         states: the robot's measured states.
     """
@@ -312,7 +325,7 @@ def layout_of(
         if states is not None and states.shape == actions.shape:
             like = states[1:]
         unclear = tuple(_no_steps(actions[1:], known, named, like))
-    return ActionLayout(kind or "undeclared", tuple(quaternions), tuple(held or ()), unclear)
+    return ActionLayout(kind or "undeclared", tuple(quaternions), tuple(held or ()), unclear, tuple(angles))
 
 
 def _no_steps(
@@ -367,7 +380,8 @@ def describe_dimensions(layout: ActionLayout, names: Sequence[str], config: Acti
 
     Args:
         layout: layout of the recorded actions.
-        names: names of their dimensions; "" or none: unknown.
+        names: a name for each of their dimensions, "" if it is unknown; none: names are unknown and no rows were
+            stacked.
         config: how they became the clip's actions.
         width: dimensions of the clip's actions; more than the recorded ones if rows were stacked.
     """
@@ -384,6 +398,8 @@ def describe_dimensions(layout: ActionLayout, names: Sequence[str], config: Acti
             what = "held"
         elif dimension in turned:
             what = f"{kind}, of a quaternion"
+        elif dimension in layout.angles:
+            what = f"{kind}, an angle"
         else:
             what = kind
         stacked = ""

@@ -5,8 +5,6 @@ It reads the records of those annotation steps (:mod:`rsjax.tools.ingest.annotat
 Axes: N recorded frames, T frames of a clip, N₀ tracks of a clip, S×S a clip's pixels.
 """
 
-import contextlib
-import itertools
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -72,24 +70,27 @@ class ClipConfig:
 
 
 def check_first(source: EpisodeSource, config: ClipConfig) -> None:
-    """Checks on the first episode, before anything is annotated, that the meaning of its actions is declared.
+    """Checks, before anything is annotated, that the meaning of the first readable episode's actions is declared.
 
     Raises:
         ConfigError: the meaning is not declared, and clips cannot be made without it.
     """
-    with contextlib.suppress(EpisodeError):  # an episode that cannot be read is quarantined later
-        for ref in itertools.islice(source.episodes(), 1):
+    for ref in source.episodes():
+        try:
             episode = source.read(ref)
             step = check_rate(episode.fps, config.windows)
-            try:
-                check_declared(ActionLayout.from_json(episode.meta.get("actions", {})), round(step), config.actions)
-            except EpisodeError as error:
-                raise ConfigError(str(error)) from error
+        except EpisodeError:
+            continue  # it is quarantined later
+        try:
+            check_declared(ActionLayout.from_json(episode.meta.get("actions", {})), round(step), config.actions)
+        except EpisodeError as error:
+            raise ConfigError(str(error)) from error
+        return
 
 
 def clip_step(config: ClipConfig, needs: tuple[str, ...] = (), cpus: float = 1.0) -> Step:
     """Returns the step that cuts clips, after the annotation steps that it needs."""
-    return Step(CLIPS, partial(_cut_episode, config), content_key(to_dict(config)), needs, version=4, cpus=cpus)
+    return Step(CLIPS, partial(_cut_episode, config), content_key(to_dict(config)), needs, version=5, cpus=cpus)
 
 
 def _cut_episode(config: ClipConfig, episode: Episode, inputs: Inputs) -> Records:
@@ -126,7 +127,8 @@ def cut(annotated: Annotated, config: ClipConfig) -> Records:
     if config.actions.compose == "stack" and whole:
         stacked = round(step)
     layout = ActionLayout.from_json(episode.meta.get("actions", {}))
-    names = flat_names(episode.meta.get("action_names"), episode.actions.shape[1])
+    recorded = episode.actions.shape[1]
+    names = flat_names(episode.meta.get("action_names"), recorded) or [""] * recorded
     pictures = _Fitted(episode.cameras[camera].read, config)
     depths, unit = _depths(annotated, camera, config, pictures)
     stored = None

@@ -55,7 +55,7 @@ KINDS = {
 }
 _CHUNK = 16  # pictures decoded at once
 _REWRITE = "rewrite the video, such as with ffmpeg -i OLD NEW.mp4"
-_TOLERANCE = 1e-3  # of a unit quaternion's length
+_TOLERANCE = 1e-3  # of a unit quaternion's length, and of π
 
 Problem = tuple[str, str]  # one of KINDS, and what is wrong where
 FEWEST = 5  # with fewer episodes, they are not compared with what is usual
@@ -143,9 +143,17 @@ def check_episode(episode: Episode, limits: Thresholds) -> tuple[list[Finding], 
     if first is not None:
         digest = hashlib.sha256(first.tobytes() + episode.actions.tobytes() + states.tobytes()).digest()
     reach = _largest(episode.actions[1:])
-    jump = _largest(np.diff(states, axis=0))
+    jump = _largest(state_steps(states))
     stats = EpisodeStats(digest, tuple(episode.cameras), reach, jump)
     return [Finding(episode.id, kind, detail) for kind, detail in problems], stats
+
+
+def state_steps(states: Float[np.ndarray, "N S"]) -> Float[np.ndarray, "M S"]:
+    """Returns the size of each step; one within ±π counts as that of an angle if this is smaller, across π."""
+    steps = np.abs(np.diff(states, axis=0))
+    ends = np.maximum(np.abs(states[1:]), np.abs(states[:-1]))
+    across = np.minimum(steps, np.abs(2 * np.pi - steps))
+    return np.where(ends < np.pi + _TOLERANCE, across, steps)
 
 
 def _largest(rows: Float[np.ndarray, "N n"]) -> Float32[np.ndarray, " n"]:

@@ -126,7 +126,8 @@ class EpisodeRef:
         id: unique within the source, safe as a file name (see :func:`rsjax.files.safe_id`).
         fingerprint: 16 hex digits, a hash of what the episode would be read from.
         location: what the source's ``read`` needs, or ``error``: why the episode cannot be read. Also ``split``: the
-            split of a store in which the episode stays.
+            split of a store in which the episode stays; and ``recording``: the same text in all episodes that show one
+            recording, which go to one split.
     """
 
     id: str
@@ -144,7 +145,8 @@ class Episode:
         task: what the robot has to do; "" if the data set does not say.
         fps: frames per second, > 0.
         timestamps: seconds from the first frame, increasing.
-        actions: row t led from frame t-1 into frame t, in the data set's own units; row 0 is zeros.
+        actions: row t led from frame t-1 into frame t, in the data set's own units; row 0 led into frame 0, or is zeros
+            if the data set does not have it.
         states: what the robot measured of itself at each frame; None if it was not recorded.
         cameras: pictures by the camera's name.
         depth: depth maps by the same names; empty if none were recorded.

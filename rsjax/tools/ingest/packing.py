@@ -132,7 +132,10 @@ def pack(
         statistics = statistics.merged(rows) if statistics else rows
         dimensions[tuple(mark["summary"]["dimensions"])] += 1
     episodes = contents.episodes()
-    successes = [(cut.success, cut.records) for cut in episodes if cut.success is not None]
+    successes = [cut.success for cut in episodes if cut.success is not None]
+    success_share = None
+    if episodes and len(successes) == len(episodes):  # else no label would look like a failure
+        success_share = sum(successes) / sum(cut.records for cut in episodes)
     quarantine: dict[str, str] = {}
     for row in summary.quarantined:  # several may share one id
         reason = f"{row['stage']}: {row['error']}"
@@ -144,7 +147,7 @@ def pack(
         "depth_range": contents.depth_range,
         "depth_unit": contents.depth_unit,
         "episodes": {split: [cut.ref.id for cut in cuts] for split, cuts in contents.splits.items()},
-        "success_share": sum(s for s, _ in successes) / sum(n for _, n in successes) if successes else None,
+        "success_share": success_share,
         "counts": {
             "found": summary.episodes,
             "done": summary.done,

@@ -143,8 +143,10 @@ def write_demo(model: Path, data_dir: Path, out: Path, number: int | None = None
     if not 0 <= number < len(source):
         raise UserError(f"--clip {number}: the model has clips 0 … {len(source) - 1}")
     clip = source[number]
-    prompt = Clips.stacked([clip], [number]).video.frames(0, trained.config.prompt_frames)
-    other = source[(number + 1) % len(source)]["actions"]
+    seen = trained.config.prompt_frames
+    prompt = Clips.stacked([clip], [number]).video.frames(0, seen)
+    following = source[(number + 1) % len(source)]["actions"]
+    other = np.concatenate([clip["actions"][:seen], following[seen:]])  # the prompt's frames have one past
     videos = trained.model.plan(trained.params, trained.assets, prompt, np.stack([clip["actions"], other]))
     depth = {}
     if videos.depth is not None:

@@ -39,7 +39,7 @@ MOST_CLIPS = 100  # in one answer
 
 
 def make_app(hub: Hub, guard: Guard, sweep: float = SWEEP) -> App:
-    """Returns the server's application, which closes the hub and its engine when it ends."""
+    """Returns the server's application, which closes the hub when it ends; its caller closes the hub's engine."""
 
     async def sweep_hub() -> None:
         while True:

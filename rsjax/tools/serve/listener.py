@@ -1,10 +1,13 @@
 """Bounds how many connections a server holds, so that idle ones cannot take all of the process's file descriptors."""
 
+import struct
 import time
+from socket import SO_SNDTIMEO, SOL_SOCKET
 from socket import socket as Socket
 from typing import Any
 
 PAUSE = 0.5  # seconds between two looks at a listener that was perhaps closed, or has no file descriptor to spare
+SEND_SECONDS = 20
 
 
 class BoundedListener(Socket):
@@ -15,12 +18,16 @@ class BoundedListener(Socket):
     Args:
         listener: the socket that listens; this object takes it over.
         most: connections that are open at a time.
+        send_seconds: seconds without progress after which the system gives up a send. An answer takes about three, and
+            fails at the last. Without a limit, sending to a client that reads nothing would never end, and closing the
+            connection would wait for it.
     """
 
-    def __init__(self, listener: Socket, most: int) -> None:
+    def __init__(self, listener: Socket, most: int, send_seconds: int = SEND_SECONDS) -> None:
         super().__init__(fileno=listener.detach())
         self.settimeout(PAUSE)
         self._most = most
+        self._send_limit = struct.pack("ll", send_seconds, 0)  # seconds and microseconds
         self._accepted: list[Socket] = []
 
     def accept(self) -> tuple[Socket, Any]:
@@ -41,6 +48,7 @@ class BoundedListener(Socket):
                 continue
             self._accepted = [each for each in self._accepted if each.fileno() >= 0]
             if len(self._accepted) < self._most:
+                connection.setsockopt(SOL_SOCKET, SO_SNDTIMEO, self._send_limit)
                 self._accepted.append(connection)
                 return connection, address
             connection.close()

@@ -11,6 +11,7 @@ from typing import Any
 
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
+from websockets.protocol import State
 from websockets.sync.server import Server, ServerConnection, serve
 
 import rsjax
@@ -184,9 +185,14 @@ class WorldServer:
             connection.send(f"all {self._settings.clients} places are taken; try again later")
             connection.close(1013, "all places are taken")
             return
+
+        def check_present() -> None:
+            if connection.state is not State.OPEN:
+                raise CancelledError("the client has left")
+
         try:
             connection.send(pack(self.metadata))
-            self.answer_messages(connection, ClientSession(self.environment, self._frames))
+            self.answer_messages(connection, ClientSession(self.environment, self._frames, check_present))
         except TimeoutError:
             connection.close(1001, f"no message for {self._settings.idle_minutes:g} minutes")
         except (ConnectionClosed, CancelledError, EngineClosedError):

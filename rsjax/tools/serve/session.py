@@ -10,13 +10,11 @@ import numpy as np
 
 from rsjax.errors import UserError, did_you_mean
 from rsjax.models.trained import as_array
-from rsjax.tools.play.messages import Refused, whole
+from rsjax.tools.policies.worlds.actions import ActionRange
 from rsjax.tools.policies.worlds.environments import WorldModelEnv
 from rsjax.tools.serve.wire import WireError
 
 START = ("seed", "clip", "rgb", "depth", "draw")  # fields that choose an episode's first frame and draws
-MOST_SEED = 2**32 - 1
-MOST_DRAW = 2**31 - 1
 
 
 class ClientSession:
@@ -25,11 +23,13 @@ class ClientSession:
     Args:
         make: makes an environment whose steps are shared with those of other clients.
         most_frames: frames of an episode or of a generated video, at most.
+        check_present: raises once the client has left.
     """
 
-    def __init__(self, make: Callable[[], WorldModelEnv], most_frames: int) -> None:
+    def __init__(self, make: Callable[[], WorldModelEnv], most_frames: int, check_present: Callable[[], None]) -> None:
         self._make = make
         self._most = most_frames
+        self._check_present = check_present
         self._env = make()
         self._frame = -1  # number of the current one; -1 before the first reset
         self._answers = {"reset": self.reset, "step": self.step, "generate": self.generate}
@@ -43,10 +43,7 @@ class ClientSession:
         name = message.get("endpoint")
         if not isinstance(name, str) or name not in self._answers:
             raise WireError(f"endpoint is {name!r:.40}; it is one of {', '.join(self._answers)}")
-        try:
-            return self._answers[name]({key: value for key, value in message.items() if key != "endpoint"})
-        except Refused as error:
-            raise WireError(error.message) from error
+        return self._answers[name]({key: value for key, value in message.items() if key != "endpoint"})
 
     def reset(self, fields: dict[str, Any]) -> dict[str, Any]:
         """Begins an episode."""
@@ -77,10 +74,14 @@ class ClientSession:
         if rows.ndim != 2 or not 2 <= len(rows) <= self._most:
             raise WireError(f"actions have shape {rows.shape}; expected (T, A) with T from 2 to {self._most}")
         env = self._make()
+        space: Any = env.action_space
+        allowed = ActionRange(space.low, space.high, "in the units of the clips' actions")
+        allowed.clip(rows, len(rows), ignored=np.arange(len(rows)) == 0)  # refuses wrong rows before any is generated
         observation, info = _begin(env, fields)
         frames = [observation]
         success = [bool(info["success"])]
         for row in rows[1:]:
+            self._check_present()
             observation, _, _, _, info = env.step(row)
             frames.append(observation)
             success.append(bool(info["success"]))
@@ -90,15 +91,10 @@ class ClientSession:
 
 def _begin(env: WorldModelEnv, fields: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
     """Resets an environment as the fields of a message say."""
-    options = {name: value for name, value in fields.items() if name != "seed"}
-    seed = None
-    if "seed" in fields:
-        seed = whole(fields, "seed", 0, MOST_SEED)
-    for name in ("clip", "draw"):
-        if name in options:
-            options[name] = whole(options, name, 0, MOST_DRAW)
-    if "rgb" in options and "clip" in options:
+    if "rgb" in fields and "clip" in fields:
         raise WireError("an episode begins with a clip or with rgb, not with both")
+    options = dict(fields)
+    seed = options.pop("seed", None)
     return env.reset(seed=seed, options=options)
 
 

@@ -3,6 +3,7 @@
 tests/models/test_families.py takes it through a whole run.
 """
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +17,10 @@ from rsjax.config import Config, presets
 from rsjax.config.config_fields import with_values
 from rsjax.data.depth_color import color_to_depth, depth_to_color
 from rsjax.data.normalization import Normalization
-from rsjax.data.store import Store
+from rsjax.data.store import Store, encode_clip, open_store, write_store
 from rsjax.errors import UserError
 from rsjax.evaluation.metrics.psnr import psnr
-from rsjax.models.base import create_autoencoder, create_model
+from rsjax.models.base import Assets, create_autoencoder, create_model
 from rsjax.models.irasim.autoencoder import KLCodec
 from rsjax.models.irasim.config import KLConfig
 from rsjax.models.irasim.dit import DiT
@@ -75,6 +76,30 @@ def test_the_latents_of_rgb_are_as_without_depth_and_a_clip_without_depth_has_ze
     assert made.depth is not None
     assert near <= made.depth[0].min() <= made.depth[0].max() <= far
     assert np.isnan(made.depth[1]).all()
+
+
+def test_an_unknown_pixel_is_one_without_depth(store: Store) -> None:
+    frames = video(store)
+    assert frames.depth is not None
+    holes = frames.depth.copy()
+    holes[0, :, 3, 4] = np.nan
+    zeros = np.nan_to_num(holes[:1], nan=0.0)
+    ours = codec(DEPTH.autoencoder, store)
+    found = ours.encode(Video(frames.rgb, holes))
+    expected = ours.encode(Video(frames.rgb[:1], zeros))
+    np.testing.assert_allclose(found["mean"][:1], expected["mean"], atol=1e-5)
+
+
+def test_latents_say_whether_depth_is_known_in_a_clips_first_frame(tmp_path: Path, store: Store) -> None:
+    known = clips.clip(0)
+    assert known.depth is not None
+    depth = known.depth.copy()
+    depth[0] = np.nan
+    records = [encode_clip(clip) for clip in (known, replace(known, depth=depth))]
+    write_store(tmp_path / "clips", "clips", {"train": records, "test": records[:1]}, {"key": "holes"})
+    assets = Assets(Normalization.create(store), toy.autoencoder_params(RGB))
+    latents = model(DEPTH).prepare(open_store(tmp_path / "clips"), assets, tmp_path, 0.0).source("train")
+    assert [bool(latents[number]["has_depth"]) for number in range(2)] == [True, False]
 
 
 def test_depth_is_refused_where_no_training_clip_has_it(tmp_path: Path, store: Store) -> None:

@@ -79,6 +79,10 @@ def test_training_starts_from_more_context_or_without_actions(config: Config, tm
     np.testing.assert_array_equal(kept["kv_pos_emb"], saved["cond_encoder"]["cross_0"]["kv_pos_emb"][64:])
     np.testing.assert_array_equal(kept["q_pos_emb"], saved["cond_encoder"]["cross_0"]["q_pos_emb"])
     assert model.pretrained_shapes(tmp_path)["action_linear"]["kernel"].shape == (config.clips.action_dim, 16)
+    blind = replace(model, config=replace(model.config, use_actions=False))
+    with_actions = random_params(blind.pretrained_shapes(tmp_path))
+    begun = blind.start(jax.eval_shape(blind.init, jax.random.key(0)), with_actions, tmp_path)
+    assert with_actions.keys() - begun.keys() == {"action_linear"}
     saved_by(tmp_path, replace(model.config, use_actions=False), 64, 0)
     assert "action_linear" not in fewer.pretrained_shapes(tmp_path)
 

@@ -115,6 +115,17 @@ def test_a_dual_model_starts_from_a_dual_model_to_the_letter(tmp_path: Path) -> 
             begin(other, place)
 
 
+@pytest.mark.parametrize("small", [{}, {"depth_width": 4, "depth_blocks": 1}], ids=["shared", "small branch"])
+def test_null_actions_are_left_out_where_no_action_is_dropped(small: dict[str, Any], tmp_path: Path) -> None:
+    dropping = replace(DUAL, **small)
+    saved = random_params(dropping)
+    save(tmp_path, dropping, saved)
+    begun = begin(depart(dropping, action_dropout=0.0), tmp_path)
+    nulls = saved.keys() - begun.keys()
+    assert nulls == {"null_action"} | ({"depth_null_action"} if small else set())
+    jax.tree.map(np.testing.assert_array_equal, begun, {name: saved[name] for name in begun})
+
+
 def test_a_model_without_actions_leaves_open_what_its_successor_sees(public: Path) -> None:
     integrated = depart(DUAL, integrate_actions=True)
     assert not np.any(begin(integrated, public)["action_encoder"]["kernel"])

@@ -16,6 +16,7 @@ from rsjax.models.roboscape.transformer import Transformer
 from rsjax.tokenizers import lfq
 from rsjax.trainable import StepContext
 from rsjax.training.step import combine
+from rsjax.training.validation import validation_loss
 from tests.models.roboscape.test_loss_terms import KEY, LOSS, random_batch, random_params
 from tests.models.roboscape.test_loss_terms import MODEL as VISIBLE
 from tests.models.roboscape.toy import depart, roboscape
@@ -84,6 +85,15 @@ def test_before_its_first_own_frames_a_step_is_the_one_on_true_frames() -> None:
     early, late = (gradient(model_of(1.0, after=5), params, batch, jnp.int32(step)) for step in (4, 5))
     jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-3, atol=1e-5), early, true)
     assert abs(late[0] - true[0]) > 1e-3
+
+
+def test_validation_reads_true_frames_from_whichever_step_on_training_reads_its_own() -> None:
+    params, batch = random_params(MODEL), random_batch()
+    off, early, late = (
+        validation_loss(model, params, [batch]) for model in (model_of(0.0), model_of(1.0), model_of(1.0, 5))
+    )
+    assert early == pytest.approx(off, rel=1e-5)
+    assert late == pytest.approx(off, rel=1e-5)
 
 
 def test_a_share_of_the_steps_reads_own_frames() -> None:

@@ -113,8 +113,8 @@ def test_a_part_alone_measures_that_part() -> None:
     assert not [name for name in measured if name.startswith(("train_", "sample_", "tokenizer_", "matmul_"))]
 
 
-def test_a_batch_of_one_clip_is_one_part() -> None:
-    config = with_values(toy(), {"train.accumulate": 2})
+def test_a_batch_of_one_clip_is_one_part_on_one_device_whatever_the_preset_has() -> None:
+    config = with_values(toy(), {"train.accumulate": 2, "runtime.sharding": "mesh", "runtime.fsdp": 2})
     assert parts.train(config, batch=1, budget=0.0)["train_step_s"] > 0
 
 

@@ -8,7 +8,8 @@ from unittest.mock import patch
 import pytest
 
 from rsjax.errors import UserError
-from rsjax.tools.commands import ablation, paper
+from rsjax.evaluation.protocols import PROTOCOLS
+from rsjax.tools.commands import ablation, evaluate, paper
 from rsjax.tools.commands.cli import main_errors, parse, parse_options
 from rsjax.tools.commands.first_screens import FIRST_SCREENS
 from rsjax.tools.commands.hub import ACTIONS as HUB
@@ -17,7 +18,7 @@ from rsjax.tools.commands.replay import Options
 from rsjax.tools.commands.store import ACTIONS as STORE
 
 NAMES = [name for group in COMMANDS.values() for name in group]
-PARTS = [*(f"hub {word}" for word in HUB), *(f"store {word}" for word in STORE)]
+PARTS = [*(f"hub {word}" for word in HUB), *(f"store {word}" for word in STORE), "export libero"]
 PRESETS = [f"{name} tiny" for name in ("train", "ablation", "describe", "compile", "bench")]
 LINES = 36  # of a terminal, at a width of 100
 # Commands that take minutes or hours. demo, play and serve run until they are stopped.
@@ -49,6 +50,13 @@ def test_help_begins_with_example_output_and_used_options(
     assert len(screen.used) <= 5
     for option in screen.used:
         assert f"--{option} " in first or f"--{option}," in first or f"--{option}\n" in first, option
+
+
+def test_the_help_of_evaluate_lists_all_protocols(capsys: pytest.CaptureFixture[str]) -> None:
+    with patch.object(sys, "argv", ["rsjax evaluate", "--help"]), contextlib.suppress(SystemExit):
+        evaluate.main()
+    listed = " ".join(capsys.readouterr().out.split())
+    assert f"{', '.join(PROTOCOLS)}, or run" in listed
 
 
 def test_the_end_says_how_long_it_took_and_what_is_next(capsys: pytest.CaptureFixture[str]) -> None:

@@ -122,6 +122,7 @@ def test_missing_depth_is_said_with_the_way_to_get_it(
 ) -> None:
     finetune(find_source(model), Recordings("npz", data), CUTTING, SETTINGS, whole.directory, only_cost=True)
     said = capsys.readouterr().out
+    assert "actions are not combined" in said and "--option kind=absolute" in said
     assert "no clip has depth: the depth loss is masked" in said and "--depth video-depth-anything:" in said
 
 
@@ -190,15 +191,19 @@ def test_what_stands_still_is_kept_if_the_camera_does_not_move_or_by_word(whole:
     assert content_key(SETTINGS) != content_key(replace(SETTINGS, keep_still="on"))
 
 
-def test_the_rule_finds_a_camera_that_stands_still(model: Path, tmp_path: Path) -> None:
+def test_the_rule_finds_a_camera_that_stands_still(
+    model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its recordings differ in their rate, and all of them become clips."""
     rng = np.random.default_rng(0)
     for number in range(4):
         frames = rng.integers(0, 256, (1, 64, 64, 3), np.uint8).repeat(7, axis=0)
         for time in range(7):
             frames[time, 8:24, 4 * time : 4 * time + 16] = 255  # a white square crosses the picture
-        np.savez(tmp_path / f"{number}.npz", frames=frames, actions=rng.normal(size=(7, 3)), fps=5.0)
+        np.savez(tmp_path / f"{number}.npz", frames=frames, actions=rng.normal(size=(7, 3)), fps=5 - number / 5)
     source = find_source(model)
     store = make_clips(Recordings("npz", tmp_path), CUTTING, source, tmp_path / "run")
+    assert not store.manifest["quarantine"] and "4.7 Hz" in capsys.readouterr().out
     assert 0 < moving_share(store) < FIXED_CAMERA
     config = prepare(source, store, replace(SETTINGS, tokenizer="keep"), tmp_path / "run")
     assert isinstance(config.model, RoboScapeConfig)
@@ -220,7 +225,8 @@ def test_few_clips_run_backwards_if_their_actions_are_known_or_never(whole: Run,
 
     assert turned(known, settings) is None  # steps, which nobody knows to act when they are recorded
     assert turned(known, replace(settings, backwards="on")) == BackwardsConfig(held=(1,))
-    targets = replace(store, manifest=store.manifest | {"action_dimensions": ["x (absolute)", "grip (held)"]})
+    named = ["yaw (absolute, an angle)", "grip (held)"]
+    targets = replace(store, manifest=store.manifest | {"action_dimensions": named})
     assert turned(targets, settings) == BackwardsConfig(held=(0, 1))
     assert turned(targets, replace(settings, backwards="off")) is None
     turns = replace(store, manifest=store.manifest | {"action_dimensions": ["q (delta, of a quaternion)"]})

@@ -25,7 +25,7 @@ def turn(axis: int, angle: float) -> np.ndarray:
 def test_a_command_leads_into_the_next_frame() -> None:
     np.testing.assert_array_equal(align_actions(np.array([[1.0], [2.0], [3.0]])), [[0], [1], [2]])
     assert align_actions(np.array([[7.0]])).tolist() == [[0]]
-    np.testing.assert_array_equal(align_actions(np.array([[1.0], [2.0], [3.0]]), after=True), [[0], [2], [3]])
+    np.testing.assert_array_equal(align_actions(np.array([[1.0], [2.0], [3.0]]), after=True), [[1], [2], [3]])
 
 
 @given(ROWS)
@@ -46,8 +46,18 @@ def test_deltas_of_skipped_frames_add_up_to_the_same_way(rows: np.ndarray, step:
 def test_differences_lead_from_one_place_to_the_other(rows: np.ndarray, step: int) -> None:
     frames = np.arange(0, len(rows), step)
     made = sampled_actions(rows, frames, ActionConfig(kind="delta"), ActionLayout("absolute"))
-    start = rows[1].astype(np.float64)  # row 0 is nothing, so the first place known is the one led into frame 1
+    first = int(not rows[0].any())  # without a row 0, the first place known is the one led into frame 1
+    start = rows[first].astype(np.float64)
     np.testing.assert_allclose((start + made.cumsum(0, dtype=np.float64))[1:], rows[frames[1:]], atol=1e-3)
+
+
+def test_differences_of_angles_go_across_pi() -> None:
+    rows = np.array([[3.0, 3.0], [3.1, 3.1], [-3.1, -3.1], [3.1, 3.1]], np.float32)
+    made = sampled_actions(rows, np.arange(4), ActionConfig(kind="delta"), ActionLayout("absolute", angles=(0,)))
+    np.testing.assert_allclose(made[:, 0], [0, 0.1, 2 * np.pi - 6.2, 6.2 - 2 * np.pi], atol=1e-5)
+    np.testing.assert_allclose(made[:, 1], [0, 0.1, -6.2, 6.2], atol=1e-5)
+    joined = sampled_actions(rows, np.array([0, 2]), ActionConfig(kind="delta"), ActionLayout("absolute", angles=(0,)))
+    np.testing.assert_allclose(joined[1], [2 * np.pi - 6.1, -6.1], atol=1e-5)
 
 
 def test_places_and_held_dimensions_keep_the_last_command() -> None:
@@ -79,6 +89,8 @@ def test_an_offset_moves_commands_to_where_they_act() -> None:
     assert early[:, 0].tolist() == [0, 1, 1, 2, 3]
     steps = sampled_actions(rows, frames, ActionConfig(offset=-2), ActionLayout("delta"))
     assert steps[:, 0].tolist() == [0, 3, 4, 0, 0]
+    known = sampled_actions(rows + 7, frames, ActionConfig(offset=1), ActionLayout("delta"))
+    assert known[:, 0].tolist() == [0, 7, 8, 9, 10]  # with row 0, which led into frame 0
 
 
 @given(st.lists(st.tuples(st.integers(0, 2), st.floats(-0.3, 0.3)), min_size=6, max_size=6))
@@ -125,12 +137,15 @@ def test_what_does_not_fit_is_reported() -> None:
         (ActionConfig(kind="absolute"), ActionLayout("delta"), "the source records deltas"),
         (EVERY, ActionLayout("absolute", quaternions=(2,)), "names dimension 2, but actions have 2"),
         (EVERY, ActionLayout("delta", held=(-1,)), "names dimension -1, but actions have 2"),
+        (EVERY, ActionLayout("delta", angles=(2,)), "angles names dimension 2, but actions have 2"),
     ):
         with pytest.raises((ConfigError, EpisodeError), match=message):
             sampled_actions(rows, np.arange(3), config, layout)
 
 
 def test_a_layout_survives_json() -> None:
-    layout = ActionLayout("absolute", (6, 10), (14, 15))
-    assert ActionLayout.from_json(json.loads(json.dumps(layout.to_json()))) == layout
+    for angles in ((), (3, 4)):
+        layout = ActionLayout("absolute", (6, 10), (14, 15), angles=angles)
+        assert ActionLayout.from_json(json.loads(json.dumps(layout.to_json()))) == layout
+        assert ("angles" in layout.to_json()) == bool(angles)
     assert ActionLayout.from_json({}) == ActionLayout()

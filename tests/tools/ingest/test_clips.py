@@ -55,6 +55,13 @@ def test_pictures_depth_and_actions_are_those_of_the_windows_frames() -> None:
     assert summary["action_dim"] == 2 and summary["actions"]["action_count"] == 15
 
 
+def test_each_row_of_a_stacked_action_is_described() -> None:
+    stacked = ClipConfig(CONFIG.windows, 8, 6, actions=ActionConfig(compose="stack"))
+    _, summary = clips(episode("a", meta={"actions": {"kind": "absolute", "held": [1]}}), stacked)
+    assert summary["dimensions"][:4] == ["(absolute, row 0)", "(held, row 0)", "(absolute, row 1)", "(held, row 1)"]
+    assert len(summary["dimensions"]) == summary["action_dim"] == 10
+
+
 def test_actions_between_frames_are_joined() -> None:
     kept, _ = clips(episode("a"))
     assert kept[0]["actions"][:, 0].tolist() == [0, 1 + 2 + 3 + 4 + 5, 6 + 7 + 8 + 9 + 10, 11 + 12 + 13 + 14 + 15]

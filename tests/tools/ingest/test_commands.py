@@ -171,7 +171,8 @@ def test_recordings_that_are_too_short_are_reported_in_numbers_with_a_cure(comma
 def test_undeclared_actions_stop_an_ingest_before_it_annotates_and_inspect_names_dimensions(
     command: Command, tmp_path: Path
 ) -> None:
-    source = folder_of_episodes(tmp_path / "source", 2)
+    source = folder_of_episodes(tmp_path / "source", 3)
+    (source / "episode_00" / "actions.npy").unlink()  # which does not hide what is wrong with the others
     (source / "dataset.json").write_text('{"fps": 10}')
     line = ["folder", source, "--out", tmp_path / "store", "--workers", 0, "--shots", "none", "--windows.frames", 3]
     text = command.refused(ingest, *line, "--windows.rate", 5)

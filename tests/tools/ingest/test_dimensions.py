@@ -9,6 +9,7 @@ from rsjax.tools.ingest.actions import (
     Kind,
     check_declared,
     describe_dimensions,
+    described_layout,
     flat_names,
     layout_of,
 )
@@ -20,7 +21,7 @@ STEPS = np.random.default_rng(0).normal(0, 0.01, (COUNT, 2)).astype(np.float32)
 
 def doubts(values: np.ndarray, name: str = "x") -> tuple[str, ...]:
     rows = np.concatenate([np.zeros(1), values])[:, None].astype(np.float32)
-    return layout_of(rows, "delta", None, (), [name]).unclear
+    return layout_of(rows, "delta", None, names=[name]).unclear
 
 
 @pytest.mark.parametrize(
@@ -76,6 +77,10 @@ def test_each_dimension_is_described() -> None:
     assert describe_dimensions(layout, (), ActionConfig(kind="delta"), 5)[3:] == ["(delta, of a quaternion)", "(held)"]
     stacked = describe_dimensions(ActionLayout("undeclared"), ["x"], ActionConfig(compose="stack"), 2)
     assert stacked == ["x (undeclared, row 0)", "x (undeclared, row 1)"]
+    turns = ActionLayout("absolute", held=(2,), angles=(1,))
+    described = describe_dimensions(turns, ["x", "yaw", "grip"], ActionConfig(), 3)
+    assert described == ["x (absolute)", "yaw (absolute, an angle)", "grip (held)"]
+    assert described_layout(described) == turns
 
 
 def test_a_refusal_names_the_dimension_and_no_number_that_could_be_mistaken_for_it() -> None:

@@ -100,6 +100,17 @@ def test_a_problem_is_found_where_it_is(kind: str, detail: str, change: Change) 
     assert "episode-2" not in diagnosis.reasons() or detail.startswith("another")
 
 
+def test_an_angle_that_passes_pi_does_not_jump() -> None:
+    def turning(seed: int, across: float) -> Episode:
+        made = episode(seed)
+        yaw = across + np.linspace(-0.05, 0.05, COUNT)
+        yaw = (yaw + np.pi) % (2 * np.pi) - np.pi
+        return replace(made, states=np.stack([yaw, yaw], 1).astype(np.float32))
+
+    episodes = [turning(seed, 1.0) for seed in range(6)]
+    assert not diagnose(ToySource((*episodes, turning(6, np.pi))), Thresholds()).findings
+
+
 def test_every_kind_is_tried() -> None:
     assert {kind for kind, _, _ in CASES} | {"unreadable", "seeking"} == set(KINDS)  # test_video_order.py
 

@@ -225,6 +225,21 @@ def test_a_manifest_tells_of_all_that_is_quarantined_under_one_name(tmp_path: Pa
     assert counts["quarantined"] == 3
 
 
+@pytest.mark.parametrize(("labelled", "share"), [(4, 1.0), (3, None), (0, None)])
+def test_the_share_of_success_is_known_if_every_episode_has_labels(
+    tmp_path: Path, labelled: int, share: float | None
+) -> None:
+    class Labelled(Source):
+        def read(self, ref: EpisodeRef) -> Episode:
+            meta: dict[str, bool] = {}
+            if ref.location["number"] < labelled:
+                meta = {"success": True}
+            return episode(ref.id, fingerprint=ref.fingerprint, meta=meta)
+
+    ingested(clip_plan(tmp_path, Labelled(4)))
+    assert open_store(tmp_path / "store").manifest["success_share"] == share
+
+
 def test_the_first_episode_does_not_say_how_long_actions_are(tmp_path: Path) -> None:
     class First(Source):
         def read(self, ref: EpisodeRef) -> Episode:

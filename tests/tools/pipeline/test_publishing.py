@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import av
@@ -12,6 +13,7 @@ from PIL import Image
 
 import rsjax
 from rsjax.clip import GENERATED_MARK
+from rsjax.config import Config
 from rsjax.data.clips import load_clips
 from rsjax.errors import UserError
 from rsjax.evaluation.results import read_result
@@ -31,18 +33,23 @@ from tests.tools.pipeline import toy
 from tests.tools.pipeline.conftest import Commands
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    """A finished run on the toy clips, with random weights and made-up scores."""
-    place = tmp_path_factory.mktemp("publishing")
-    run = Run(toy.config(), place / "run", place / "data")
-    trained = toy.trained(toy.store(run.clips))
+def with_weights(config: Config, place: Path) -> Run:
+    """A run on the toy clips, with random weights."""
+    run = Run(config, place / "run", place / "data")
+    trained = toy.trained(toy.store(run.clips), config)
     run.prepare(overwrite=False)
     toy.save_tokenizer(run)
     run.output("world_model").parent.mkdir(parents=True)
     save_weights(run.output("world_model"), trained.params)
     (run.directory / "tokens").mkdir()
     trained.assets.normalization.save(run.directory / "tokens")
+    return run
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """A finished run on the toy clips, with random weights and made-up scores."""
+    run = with_weights(toy.config(), tmp_path_factory.mktemp("publishing"))
     record_start(run, "rsjax train toy --run-dir run")
     scores = {"psnr": 23.256, "psnr_repeat_first": 16.0, "psnr_tokenizer": 25.7, "delta_psnr": 7.3, "ssim": None}
     (run.directory / "metrics.json").write_text(json.dumps(scores))
@@ -96,6 +103,12 @@ def test_the_loss_of_rounding_is_the_difference_of_two_means(run: Run, published
     means = [predicted_psnr(model, clips).mean() for model in (exact, rounded)]
     assert f"a loss of {means[0] - means[1]:.3f} dB" in loss_of_rounding(exact, rounded, clips, "float16")
     assert "a loss of 0.000 dB" in loss_of_rounding(exact, exact, clips, "float32")
+
+
+def test_the_demo_begins_with_as_many_frames_as_the_model(tmp_path: Path) -> None:
+    two = with_weights(replace(toy.config(), prompt_frames=2), tmp_path)
+    video, _ = write_demo(two.directory, two.data_directory, tmp_path / "demo")
+    assert video.exists()
 
 
 def test_videos_the_demo_and_the_playground_work_from_the_directory_alone(published: Path, tmp_path: Path) -> None:

@@ -163,6 +163,41 @@ def test_a_session_is_recorded_exported_and_linked(opened: Open, server: Server)
         each.keyboard.press("End")
         each.wait_for_function("max => document.querySelector('.transport input').value === max", arg=length)
     other.wait_for_function(f"pixels => ({_PIXELS})()[0] === pixels", arg=page.evaluate(_PIXELS)[0])
+    for each in (page, other):  # a link that was made, and one that was loaded
+        _drive(each, "d", int(length) + 3)
+        sent: list[str] = []
+        take = sent.append
+        each.on("websocket", lambda socket, take=take: socket.on("framesent", lambda data: take(str(data))))
+        each.reload()
+        each.wait_for_function(_LENGTH, arg=int(length) + 3)
+        _drive(each, "d", int(length) + 4)
+        assert sent and not [text for text in sent if '"type":"load"' in text]
+
+
+def test_without_a_clipboard_the_page_says_where_the_link_is(opened: Open) -> None:
+    page = opened()
+    page.evaluate("() => Object.defineProperty(navigator, 'clipboard', { value: undefined })")  # as over plain http
+    page.get_by_text("Keep", exact=True).click()
+    page.get_by_role("button", name="Copy a link").click()
+    page.wait_for_function("() => document.getElementById('notes').textContent.includes('stands in the address bar')")
+
+
+_SOCKETS = """async () => {
+  const { connect } = await import('/page/connection.js');
+  const pass = () => {};
+  let opened = 0;
+  const on = { open: () => opened++, message: pass, frame: pass, lost: pass, closed: pass };
+  const connection = connect({ session: () => null, on });
+  const early = await connection.upload(new Blob(['x'])).catch(({ code }) => code);
+  connection.again();
+  connection.again();
+  await new Promise(done => setTimeout(done, 1500));
+  return [early, opened];
+}"""
+
+
+def test_one_socket_is_open_at_a_time_and_refuses_an_upload_before_it_is(opened: Open) -> None:
+    assert opened().evaluate(_SOCKETS) == ["lost", 1]
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])

@@ -39,6 +39,7 @@ from rsjax.tools.play.serve import listen
 from rsjax.tools.policies.run_data import RunData
 from rsjax.tools.policies.worlds.environments import WorldModelEnv
 from rsjax.tools.serve.client import RemoteWorldModelEnv, ServerError, WorldClient
+from rsjax.tools.serve.listener import BoundedListener
 from rsjax.tools.serve.server import STRIKES, WorldServer, WorldServerSettings
 from rsjax.tools.serve.shared_steps import SharedSteps
 from rsjax.tools.serve.wire import pack, unpack
@@ -77,9 +78,9 @@ def local(clips: Store, model: TrainedModel) -> WorldModelEnv:
 
 
 @contextmanager
-def serving(run: PlayRun, **settings: Any) -> Iterator[str]:
+def serving(run: PlayRun, kind: type[WorldServer] = WorldServer, **settings: Any) -> Iterator[str]:
     """Serves a run; yields the address."""
-    world = WorldServer(run, WorldServerSettings(port=0, frames=FRAMES, **settings))
+    world = kind(run, WorldServerSettings(port=0, frames=FRAMES, **settings))
     listener = listen("127.0.0.1", 0)
     server = world.open(listener)
     thread = threading.Thread(target=server.serve_forever, daemon=True)
@@ -184,7 +185,10 @@ def test_the_remote_environment_is_one_for_gymnasium(url: str, local: WorldModel
     assert isinstance(remote, RemoteWorldModelEnv)
     assert remote.observation_space == local.observation_space and remote.action_space == local.action_space
     check_env(remote, skip_render_check=True)
-    assert env.reset(seed=11)[1]["clip"] == local.reset(seed=11)[1]["clip"]  # a seed chooses the same clip and draws
+    chosen = env.reset(seed=11)[1]["clip"]
+    assert chosen == local.reset(seed=11)[1]["clip"]  # a seed chooses the same clip and draws
+    assert isinstance(chosen, np.integer) and env.reset(options={"clip": chosen})[1]["clip"] == chosen
+    assert remote.client.reset(seed=np.int64(11), draw=np.int32(0))["clip"] == chosen
     clip = clips.source("test")[2]
     seen, _ = env.reset(options={"rgb": clip["rgb"][0], "depth": clip["depth"][0], "draw": 5})
     assert_same(seen, local.reset(options={"clip": 2, "draw": 5})[0])
@@ -208,14 +212,18 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"endpoint": "step", "action": np.full(28, np.inf)}, "actions[0] is inf"),
     ({"endpoint": "step", "action": {"a": 1}}, "expected floats of shape (28,)"),
     ({"endpoint": "reset", "clip": 99}, "no clip 99 in the test split, which has 0 … 4"),
-    ({"endpoint": "reset", "clip": "1"}, "clip is '1'; it is a whole number"),
-    ({"endpoint": "reset", "draw": -1}, "draw is -1"),
-    ({"endpoint": "reset", "seed": 2**40}, "seed is 1099511627776"),
+    ({"endpoint": "reset", "clip": "1"}, "no clip '1' in the test split, which has 0 … 4"),
+    ({"endpoint": "reset", "clip": np.array([1, 2])}, "no clip array([1, 2])"),
+    ({"endpoint": "reset", "draw": -1}, "the option draw is -1; it is a whole number"),
+    ({"endpoint": "reset", "seed": 2**40}, "seed is 1099511627776; it is a whole number"),
+    ({"endpoint": "reset", "seed": {}}, "seed is {}"),
     ({"endpoint": "reset", "rgb": np.zeros((8, 8, 3), np.uint8)}, "expected (64, 64, 3)"),
     ({"endpoint": "reset", "rgb": "x", "clip": 1}, "not with both"),
     ({"endpoint": "generate", "actions": np.zeros((1, 28))}, "T from 2 to 9"),
     ({"endpoint": "generate", "actions": np.zeros((10, 28))}, "T from 2 to 9"),
     ({"endpoint": "generate", "actions": [[1.0], [1.0, 2.0]]}, "actions"),
+    ({"endpoint": "generate", "actions": np.zeros((5, 7))}, "actions have shape (5, 7); expected (5, 28)"),
+    ({"endpoint": "generate", "actions": np.outer([0, 0, 0, 0, np.inf], np.ones(28))}, "actions[4, 0] is inf"),
     ({"endpoint": "generate"}, "actions"),
 ]
 
@@ -259,6 +267,30 @@ def test_a_client_without_sense_and_a_large_message_end_the_connection(url: str)
         with pytest.raises(ConnectionClosed) as closed:
             socket.recv()
         assert closed.value.rcvd is not None and closed.value.rcvd.code == 1009
+
+
+def test_a_video_is_not_generated_on_for_a_client_that_has_left(run: PlayRun) -> None:
+    left = threading.Event()
+    steps: list[Any] = []
+
+    class WaitingEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
+        def step(self, action: Any) -> Any:
+            steps.append(action)
+            left.wait(60)
+            return super().step(action)
+
+    class WaitingServer(WorldServer):
+        def environment(self) -> Any:
+            return WaitingEnv(super().environment())
+
+    with serving(run, WaitingServer, clients=1) as url:
+        client = WorldClient(url)
+        client.socket.send(pack({"endpoint": "generate", "actions": actions(FRAMES)}))
+        wait_until(lambda: len(steps) == 1)
+        client.close()
+        left.set()
+        wait_until(lambda: free(url))
+    assert len(steps) == 1
 
 
 def test_the_first_message_describes_model_and_limits(url: str) -> None:
@@ -336,6 +368,19 @@ def test_connections_that_say_nothing_are_bounded_and_let_others_in_when_they_le
             connections = idle(url, most + 5, everything)
             wait_until(lambda: sum(map(is_closed, connections)) == 5)
         wait_until(lambda: is_healthy(url))
+
+
+def test_sending_to_a_client_that_reads_nothing_ends() -> None:
+    with (
+        BoundedListener(listen("127.0.0.1", 0), 1, send_seconds=1) as listener,
+        socket.create_connection(listener.getsockname()) as client,
+        listener.accept()[0] as connection,
+    ):
+        rescue = threading.Timer(30, client.close)  # then sending fails otherwise
+        rescue.start()
+        with pytest.raises(BlockingIOError):
+            connection.sendall(bytes(2**26))
+        rescue.cancel()
 
 
 SERVER_OF_FEW_FILES = """

@@ -8,8 +8,9 @@ which are added to all cells alike, drop out. Neither features of 0 nor features
 minimum, since their cosine is 0.
 
 The teacher, from which no gradient flows (sg), is the network itself in the same pass: the first frame is never masked
-and sees no other frame, so these are the features of the true first frame, and they cost nothing. Averaged weights as
-teacher would need a second pass, and most presets average none.
+and sees no other frame, so its features depend on no prediction, and they cost nothing. They are those of the true
+first frame only if ``model.corruption`` is off; otherwise some of its tokens are random, as in every frame.
+Averaged weights as teacher would need a second pass, and most presets average none.
 
 Axes: B clips, T frames, S cells, C width, K keypoints.
 """

@@ -4,6 +4,8 @@ A rollout reads frames that the model predicted, not true ones. If frames are ma
 all frames of a clip, each from the true frame before it, and the mean codes of that pass stand in for those of a
 rollout (arXiv 1906.04331, "Parallel Scheduled Sampling", with mean codes instead of drawn tokens).
 
+With ``model.corruption``, some tokens of the "true" frames are random: they are those that the network reads.
+
 Axes: B clips, T frames, S cells, D code bits.
 """
 
@@ -41,11 +43,12 @@ def previous_frames(
 ) -> Previous:
     """Returns the codes of the frame before each frame: the true ones, or if ``own`` the model's mean codes.
 
-    The prompt's frames stay true, as in a rollout. No gradient flows into the predictions.
+    The prompt's frames stay true, as in a rollout. No gradient flows into the predictions. With ``model.corruption``
+    the true frames are corrupted ones, the prompt's too.
 
     Args:
         predict: the network on the true frames: returns its logits and its cache; not computed unless ``own``.
-        tokens: of the true frames, by modality that the network reads.
+        tokens: of the true frames, corrupted as the network reads them, by modality.
         own: whether to return the model's codes; the same on all devices.
         prompt_frames: those that generation starts from.
     """

@@ -89,7 +89,7 @@ def gripper_changes(episode: Episode, least: float) -> list[int]:
     """
     changes = set[int]()
     for dimension in ActionLayout.from_json(episode.meta.get("actions", {})).held:
-        command = episode.actions[1:, dimension]  # row 0 of the actions is zeros
+        command = episode.actions[1:, dimension]  # row 0 may be unknown
         if not len(command) or np.ptp(command) < least:
             continue
         position = (command - command.min()) / np.ptp(command)

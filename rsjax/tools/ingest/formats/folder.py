@@ -89,6 +89,7 @@ class FolderConfig:
             combined.
         held: likewise.
         quaternions: likewise.
+        angles: likewise.
     """
 
     task: str | None = ""
@@ -98,6 +99,7 @@ class FolderConfig:
     kind: Kind | None = None
     held: tuple[int, ...] | None = None
     quaternions: tuple[int, ...] = ()
+    angles: tuple[int, ...] = ()
 
 
 def open_source(
@@ -110,6 +112,7 @@ def open_source(
     kind: Kind | None = None,
     held: Sequence[int] | None = None,
     quaternions: Sequence[int] | None = None,
+    angles: Sequence[int] | None = None,
 ) -> "Folder":
     """Opens the data set at ``path``; options as in :class:`FolderConfig`, None: as ``dataset.json`` says.
 
@@ -125,7 +128,7 @@ def open_source(
         values = {}
     from_json(FolderConfig, values, file)
     options: dict[str, object] = {"task": task, "fps": fps, "after": after, "action": action}
-    options |= {"kind": kind, "held": held, "quaternions": quaternions}
+    options |= {"kind": kind, "held": held, "quaternions": quaternions, "angles": angles}
     config = from_json(FolderConfig, values | {k: v for k, v in options.items() if v is not None}, path)
     if not 0 <= config.fps <= MAX_FPS:
         raise SourceError(f"{path}: fps is {config.fps!r}, should be a number from 0 to {MAX_FPS:g}; mend it")
@@ -202,7 +205,7 @@ class Folder:
         states = None
         if measured:
             states = columns(table, measured, table_path)[0]
-        layout = layout_of(actions, config.kind, config.held, config.quaternions, names, states)
+        layout = layout_of(actions, config.kind, config.held, config.quaternions, config.angles, names, states)
         check_layout(layout, actions.shape[1], table_path)
         episode = Episode(
             id=ref.id,
@@ -242,6 +245,8 @@ class Folder:
         except (EpisodeError, OSError):
             files = []  # reading the episode reports why
         config = dataclasses.asdict(self._config)
+        if not self._config.angles:  # so that the fingerprints of data sets without angles stay as they were
+            del config["angles"]
         identity = safe_id(f"{name}.flat" if flat and (self._root / name).is_dir() else name)
         return EpisodeRef(identity, fingerprint(files, name, sizes, config), {"name": name, "flat": flat})
 

@@ -178,8 +178,11 @@ def fps_of(settings: dict[str, Any], path: Path) -> float:
 
 def kind_of(settings: dict[str, Any]) -> Kind:
     """Returns the kind of the arms' commands: targets if robosuite's controller settings, old or new, say so."""
+    controllers = [settings.get("controller_configs")]  # where robosuite's own files have them
     arguments = settings.get("env_kwargs")
-    text = json.dumps(arguments.get("controller_configs") if isinstance(arguments, dict) else None)
+    if isinstance(arguments, dict):
+        controllers.append(arguments.get("controller_configs"))
+    text = json.dumps(controllers)
     if '"control_delta": false' in text or '"input_type": "absolute"' in text:
         return "absolute"
     return "delta"

@@ -29,6 +29,7 @@ class KeyMap:
         after: whether a step's observation was recorded after its action, contrary to the convention.
         depth: the feature of each camera's depth maps, by the camera's name.
         depth_scale: length in metres of one unit of a depth map of whole numbers; floats are metres.
+        angles: dimensions of the action that are angles in radians, likewise.
         names: names of the data sets that this map is for.
     """
 
@@ -43,6 +44,7 @@ class KeyMap:
     after: bool = False
     depth: Mapping[str, str] = field(default_factory=dict)
     depth_scale: float = 0.001
+    angles: tuple[int, ...] = ()
     names: tuple[str, ...] = field(default=(), compare=False)
 
     def to_json(self) -> dict[str, Any]:
@@ -76,6 +78,7 @@ MAPS: dict[str, KeyMap] = {
         ("observation/state",),
         kind="absolute",
         after=True,
+        angles=(3, 4, 5),
     ),
     "bridge_oxe": KeyMap(
         _cameras("image"),

@@ -66,6 +66,7 @@ def open_source(
     kind: Kind | None = None,
     held: Sequence[int] | None = None,
     quaternions: Sequence[int] = (),
+    angles: Sequence[int] = (),
 ) -> "LeRobot":
     """Opens the data set at ``path``, the folder that contains ``meta``.
 
@@ -73,10 +74,10 @@ def open_source(
         action: the column of actions.
         state: the column of states; if it is missing, episodes have none.
         kind: what the actions are, which the format does not say; see
-            :class:`rsjax.tools.ingest.actions.ActionLayout`. None: absolute, unless the names of the dimensions contain
-            ``delta``; then the kind has to be declared.
+            :class:`rsjax.tools.ingest.actions.ActionLayout`. None: not declared, so rows of actions are not combined.
         held: likewise.
         quaternions: likewise.
+        angles: likewise.
 
     Raises:
         SourceError: ``meta`` cannot be read, or there is no such column of actions.
@@ -87,35 +88,36 @@ def open_source(
     tasks = _tasks(path / "meta", info.shared)
     exported = exists(path / "meta" / EXPORTED)
     generated = _generated(path / "meta" / PROVENANCE)
-    names = str(info.features[action].get("names")).lower()
     if held is None:
         stay = None
     else:
         stay = tuple(held)
-    declared = Declared(kind or (None if "delta" in names else "absolute"), stay, tuple(quaternions))
+    declared = Declared(kind, stay, tuple(quaternions))
+    turning = tuple(angles)
     recordings: tuple[str, ...] = ()
     if exported:
-        recordings, meaning = _about(path / "meta" / EXPORTED)
-        if meaning and (kind, held, tuple(quaternions)) == (None, None, ()):
+        recordings, meaning, turned = _about(path / "meta" / EXPORTED)
+        if meaning and (*declared, turning) == (None, None, (), ()):
             declared = meaning
-    return LeRobot(path, info, tasks, declared, action, state, exported, generated, recordings)
+            turning = turned
+    return LeRobot(path, info, tasks, declared, action, state, exported, generated, recordings, turning)
 
 
-def _about(path: Path) -> tuple[tuple[str, ...], Declared | None]:
-    """Returns of which recording each exported clip is, and what the actions are if the file says so."""
+def _about(path: Path) -> tuple[tuple[str, ...], Declared | None, tuple[int, ...]]:
+    """Returns of which recording each exported clip is, what the actions are if the file says so, and their angles."""
     about = read_json(path)
     try:
         recordings = tuple(map(str, about.get("recordings") or ()))
         if "actions" not in about:
-            return recordings, None
+            return recordings, None, ()
         layout = ActionLayout.from_json(about["actions"])
         if layout.kind not in ("absolute", "delta") or not all(
-            isinstance(number, int) for number in layout.held + layout.quaternions
+            isinstance(number, int) for number in layout.held + layout.quaternions + layout.angles
         ):
             raise ValueError(f"actions are {about['actions']!r:.80}")
     except (AttributeError, TypeError, ValueError) as error:
         raise SourceError(f"{path}: field missing or wrong ({error}); export the store again") from error
-    return recordings, Declared(layout.kind, layout.held, layout.quaternions)
+    return recordings, Declared(layout.kind, layout.held, layout.quaternions), layout.angles
 
 
 @dataclass(frozen=True)
@@ -194,6 +196,7 @@ class LeRobot:
         exported: bool = False,
         generated: frozenset[int] = frozenset(),
         recordings: tuple[str, ...] = (),
+        angles: tuple[int, ...] = (),
     ) -> None:
         self._root = root
         self._info = info
@@ -204,6 +207,7 @@ class LeRobot:
         self._exported = exported  # by this project, which writes clips: each is one shot
         self._generated = generated
         self._recordings = recordings  # which recording each clip is of
+        self._angles = angles
         self._known = fingerprint((), sorted(tasks.items()))
 
     def episodes(self) -> Iterator[EpisodeRef]:
@@ -245,7 +249,7 @@ class LeRobot:
             states = matrix(table, self._state, path)
         else:
             states = None
-        layout = layout_of(align_actions(actions), *self._declared, dimensions, states)
+        layout = layout_of(align_actions(actions), *self._declared, self._angles, dimensions, states)
         check_layout(layout, actions.shape[1], path)
         tasks: list[str] = []
         if "task_index" in table.column_names and self._tasks:
@@ -328,7 +332,8 @@ class LeRobot:
         if number < len(self._recordings):
             location["recording"] = self._recordings[number]
         paths = [location["data"], *(video["path"] for video in location["videos"].values())]
-        mark = fingerprint([inside(self._root, path) for path in paths], location, self._declared, self._known)
+        declared = (self._declared, self._known, *([self._angles] if self._angles else []))
+        mark = fingerprint([inside(self._root, path) for path in paths], location, *declared)
         return EpisodeRef(f"episode_{number:06d}", mark, location)
 
     def _check_rows(

@@ -1,7 +1,8 @@
 """Reads LIBERO HDF5 files: robomimic's layout, one file per task, with two pitfalls.
 
 Pictures are stored bottom row first, as OpenGL renders them, and ``obs[t]`` was recorded *after* ``actions[t]``: that
-action led into it. The reader is tested on files of the documented layout that the tests write.
+action led into it. Files that OpenVLA's script made from them have ``obs[t]`` before ``actions[t]``. The reader is
+tested on files of the documented layout that the tests write.
 """
 
 import dataclasses
@@ -20,7 +21,9 @@ LIBERO = Convention(
 )
 
 
-def open_source(path: Path, filter: str = "", depth: bool = False, half_turn: bool = False) -> DemoSource:
+def open_source(
+    path: Path, filter: str = "", depth: bool = False, half_turn: bool = False, after: bool = True
+) -> DemoSource:
     """Opens a LIBERO data set.
 
     Args:
@@ -29,5 +32,10 @@ def open_source(path: Path, filter: str = "", depth: bool = False, half_turn: bo
         depth: likewise.
         half_turn: rotate pictures by 180°, which mirrors left and right, as OpenVLA and its successors train on them;
             otherwise they are flipped upright, as LIBERO's own videos are.
+        after: whether ``obs[t]`` was recorded after ``actions[t]``; False for files of OpenVLA's
+            ``regenerate_libero_dataset.py``.
     """
-    return open_demos(path, dataclasses.replace(LIBERO, stored="half turn") if half_turn else LIBERO, filter, depth)
+    convention = dataclasses.replace(LIBERO, after=after)
+    if half_turn:
+        convention = dataclasses.replace(convention, stored="half turn")
+    return open_demos(path, convention, filter, depth)

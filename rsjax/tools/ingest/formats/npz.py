@@ -55,6 +55,7 @@ class NpzConfig:
     kind: str
     held: tuple[int, ...] | None
     quaternions: tuple[int, ...]
+    angles: tuple[int, ...] = ()
 
 
 def open_source(
@@ -68,6 +69,7 @@ def open_source(
     kind: Kind | None = None,
     held: Sequence[int] | None = None,
     quaternions: Sequence[int] = (),
+    angles: Sequence[int] = (),
 ) -> "NpzFolder":
     """Opens a folder of episodes, or a single one.
 
@@ -80,6 +82,7 @@ def open_source(
         kind: kind of the actions in files that do not say; see ``actions.ActionLayout``.
         held: likewise.
         quaternions: likewise.
+        angles: likewise.
 
     Raises:
         SourceError: there are no files, or ``fps`` is not possible.
@@ -98,7 +101,7 @@ def open_source(
         stay = None
     else:
         stay = tuple(held)
-    settings = NpzConfig(frames, actions, task, float(fps), after, kind or "", stay, tuple(quaternions))
+    settings = NpzConfig(frames, actions, task, float(fps), after, kind or "", stay, tuple(quaternions), tuple(angles))
     return NpzFolder(folder, tuple(str(file.relative_to(folder)) for file in files), settings)
 
 
@@ -119,8 +122,11 @@ class NpzFolder:
 
     def episodes(self) -> Iterator[EpisodeRef]:
         """Lists the files by name."""
+        settings = asdict(self.settings)
+        if not self.settings.angles:  # so that the fingerprints of data sets without angles stay as they were
+            del settings["angles"]
         for file in self.files:
-            mark = fingerprint([self.folder / file], file, asdict(self.settings))
+            mark = fingerprint([self.folder / file], file, settings)
             yield EpisodeRef(safe_id(file.removesuffix(".npz").replace("/", "-")), mark, {"file": file})
 
     def read(self, ref: EpisodeRef) -> Episode:
@@ -141,7 +147,7 @@ class NpzFolder:
         else:
             states = None
         declared: dict[str, Kind] = {"absolute": "absolute", "delta": "delta"}
-        layout = layout_of(actions, declared.get(kind), how.held, how.quaternions, (), states)
+        layout = layout_of(actions, declared.get(kind), how.held, how.quaternions, how.angles, (), states)
         check_layout(layout, commands.shape[1], path)
         times = _times(path, count, how.fps)
         meta = {"source": "npz", "file": ref.location["file"], "actions": layout.to_json()}

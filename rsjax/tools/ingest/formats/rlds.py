@@ -143,6 +143,8 @@ class RldsSource:
                 stem = safe_id(shard)
             counts = expected.get(shard, 0), "dataset_info.json names"
             settings = {n: v for n, v in asdict(self.keys).items() if self.keys.depth or not n.startswith("depth")}
+            if not self.keys.angles:  # so that the fingerprints of data sets without angles stay as they were
+                del settings["angles"]
             yield from record_refs(self.folder, shard, f"{stem}-{{:05d}}", counts, settings)
         if self.single:
             return
@@ -179,7 +181,7 @@ class RldsSource:
         states = None
         if keys.state:
             states = _joined(example, keys.state, count)[0]
-        layout = layout_of(actions, keys.kind, keys.held, keys.quaternions, names, states)
+        layout = layout_of(actions, keys.kind, keys.held, keys.quaternions, keys.angles, names, states)
         check_layout(layout, actions.shape[1], f"{example.where}: key map")
         texts = _texts(example, self.keys.task, count)
         segments = [segment for segment in runs(texts) if segment.text]

@@ -6,7 +6,9 @@ has the models (:mod:`rsjax.tools.ingest.formats.rendered`). LIBERO's files have
 (:mod:`rsjax.tools.ingest.formats.libero`), so this module reads both, each by its :class:`Convention`.
 """
 
-from collections.abc import Iterator
+import hashlib
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -18,9 +20,9 @@ from jaxtyping import Float32
 from rsjax.clip import words_of
 from rsjax.errors import did_you_mean
 from rsjax.files import safe_id
-from rsjax.tools.ingest.actions import ActionLayout, align_actions, continuous_signs
+from rsjax.tools.ingest.actions import ActionLayout, Kind, align_actions, check_layout, continuous_signs
 from rsjax.tools.ingest.episode import LEAVE_OUT, Episode, EpisodeError, EpisodeRef, SourceError, checked, fingerprint
-from rsjax.tools.ingest.formats.files import broken, inside, location_of
+from rsjax.tools.ingest.formats.files import MAX_CELLS, broken, inside, location_of
 from rsjax.tools.ingest.formats.hdf5 import (
     H5Frames,
     Stored,
@@ -69,7 +71,14 @@ ROBOMIMIC = Convention(
 )
 
 
-def open_source(path: Path, filter: str = "", depth: bool = False, size: int = 128) -> "DemoSource":
+def open_source(
+    path: Path,
+    filter: str = "",
+    depth: bool = False,
+    size: int = 128,
+    kind: Kind | None = None,
+    held: Sequence[int] | None = None,
+) -> "DemoSource":
     """Opens a robomimic data set.
 
     Args:
@@ -77,16 +86,27 @@ def open_source(path: Path, filter: str = "", depth: bool = False, size: int = 1
         filter: read only demos that ``mask/<filter>`` lists, such as ``train``.
         depth: read ``obs/<camera>_depth`` as metres. Rendered demos always have depth.
         size: side of rendered pictures in pixels, 8 to 1024.
+        kind: kind of the actions (:class:`rsjax.tools.ingest.actions.ActionLayout`), in place of what the controller's
+            settings say, which tools that rewrite actions often leave as they were.
+        held: dimensions whose command stays in force, likewise; None: the last of each arm's seven dimensions.
 
     Raises:
         SourceError: there are no files, none has pictures or can be rendered, or an option is impossible.
     """
     if not 8 <= size <= 1024:
         raise SourceError(f"robomimic: option size is {size}; choose one from 8 to 1024")
-    return open_demos(path, ROBOMIMIC, filter, depth, size)
+    return open_demos(path, ROBOMIMIC, filter, depth, size, kind, held)
 
 
-def open_demos(path: Path, convention: Convention, filter: str, depth: bool, size: int = 0) -> "DemoSource":
+def open_demos(
+    path: Path,
+    convention: Convention,
+    filter: str,
+    depth: bool,
+    size: int = 0,
+    kind: Kind | None = None,
+    held: Sequence[int] | None = None,
+) -> "DemoSource":
     """Opens a data set of this layout. Arguments and errors as in :func:`open_source`."""
     folder = path.parent
     files = [path]
@@ -96,7 +116,10 @@ def open_demos(path: Path, convention: Convention, filter: str, depth: bool, siz
     if not files:
         raise SourceError(f"{path}: no *.hdf5 files; give the {convention.name} file, or the folder with them")
     names = tuple(str(file.relative_to(folder)) for file in files)
-    source = DemoSource(folder, names, convention, filter, depth, convention.name, size)
+    stay = None
+    if held is not None:
+        stay = tuple(held)
+    source = DemoSource(folder, names, convention, filter, depth, convention.name, size, kind, stay)
     for file in files:  # if the first demo that can be read has no pictures, none has
         try:
             demos = source.demos(file)
@@ -127,6 +150,8 @@ class DemoSource:
         depth: whether depth maps are read.
         name: the convention's name.
         size: side of rendered pictures in pixels.
+        kind: kind of the actions; None: as the controller's settings say.
+        held: dimensions whose command stays in force; None: the grippers'.
     """
 
     folder: Path
@@ -136,20 +161,33 @@ class DemoSource:
     depth: bool
     name: str
     size: int = 0
+    kind: Kind | None = None
+    held: tuple[int, ...] | None = None
 
     def episodes(self) -> Iterator[EpisodeRef]:
-        """Lists each file's demos by their numbers. A file that cannot be read is one entry, which ``read`` refuses."""
+        """Lists each file's demos by their numbers. A file that cannot be read is one entry, which ``read`` refuses.
+
+        Several files of a folder may have the same demo: as states, as pictures, with other actions. Demos that begin
+        in the same simulator state count as one recording, so that they go to one split.
+        """
+        declared = (self.kind, self.held)
         for file in self.files:
             path = self.folder / file
             stem = file.rpartition(".")[0].replace("/", "-")
             try:
                 demos = self.demos(path)
+                with open_file(path) as content:
+                    motions = [simulated_motion(content, demo, path) for demo in demos]
             except EpisodeError as error:
                 yield broken(safe_id(stem), str(error))
                 continue
-            for demo in demos:
-                mark = fingerprint([path], demo, asdict(self.convention), self.depth)
-                yield EpisodeRef(safe_id(f"{stem}-{demo}"), mark, {"file": file, "demo": demo})
+            for demo, motion in zip(demos, motions, strict=True):
+                settings = [asdict(self.convention), self.depth]
+                if declared != (None, None):
+                    settings.append(declared)
+                mark = fingerprint([path], demo, *settings)
+                identity = safe_id(f"{stem}-{demo}")
+                yield EpisodeRef(identity, mark, {"file": file, "demo": demo, "recording": motion or identity})
 
     def read(self, ref: EpisodeRef) -> Episode:
         """Reads one demo."""
@@ -170,16 +208,22 @@ class DemoSource:
             cameras, depth = self.pictures(group, path)
             fps = fps_of(settings, path) or how.fps
             states, flipped = _states(group.get("obs", {}), how, path)
-            named = path.stem.removesuffix("_demo").replace("_", " ")  # LIBERO names files after tasks
             width = commands.shape[1]  # a gripper is the last of each arm's seven dimensions, else the last of all
             if width % 7 == 0:
                 grippers = tuple(range(6, width, 7))
             else:
                 grippers = (width - 1,)
+            if self.held is not None:
+                grippers = self.held
+            layout = ActionLayout(self.kind or kind_of(settings), held=grippers)
+            check_layout(layout, width, path)
+            task = instruction_of(group, settings)
+            if not task and how.name == "libero":
+                task = path.stem.removesuffix("_demo").replace("_", " ")  # LIBERO names files after tasks
             episode = Episode(
                 id=ref.id,
                 fingerprint=ref.fingerprint,
-                task=instruction_of(group, settings) or (named if how.after else words_of(settings.get("env_name"))),
+                task=task or words_of(settings.get("env_name")),
                 fps=fps,
                 timestamps=np.arange(len(commands)) / fps,
                 actions=align_actions(commands, how.after),
@@ -192,7 +236,7 @@ class DemoSource:
                     "demo": ref.location["demo"],
                     "environment": words_of(settings.get("env_name")),
                     "notes": {"flipped": flipped} if flipped else {},
-                    "actions": ActionLayout(kind_of(settings), held=grippers).to_json(),
+                    "actions": layout.to_json(),
                 },
             )
             return checked(episode, f"{path}: data/{demo}")
@@ -242,6 +286,19 @@ class DemoSource:
                 raise SourceError(f"{path}: no mask/{self.filter}{hint}; it has {', '.join(masks) or 'no filters'}")
             listed = masks[self.filter][()]
         return sorted((name.decode() if isinstance(name, bytes) else str(name) for name in listed), key=_number)
+
+
+def simulated_motion(content: h5py.File, demo: str, path: Path) -> str:
+    """Returns a hash of the simulator's first and last state in a demo; "" if the file has none that can be read.
+
+    Files with other pictures or actions of the same demo have the same states.
+    """
+    with suppress(EpisodeError, OSError, RuntimeError, KeyError, TypeError, ValueError):  # refused when it is read
+        states = member(content, f"data/{demo}/states", path)
+        numbers = isinstance(states, h5py.Dataset) and states.ndim == 2 and states.dtype.kind in "fiu"
+        if numbers and 0 < states.size <= MAX_CELLS:
+            return hashlib.sha256(states[0].tobytes() + states[-1].tobytes()).hexdigest()[:16]
+    return ""
 
 
 def _observed(group: Any, path: Path) -> Any:

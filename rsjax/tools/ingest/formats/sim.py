@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 
 from rsjax.clip import UNKNOWN, words_of
-from rsjax.data.store import Record, Store, StoreError, open_store
+from rsjax.data.state_labels import knows_success
+from rsjax.data.store import Record, Source, Store, StoreError, open_store
 from rsjax.errors import did_you_mean
-from rsjax.tools.ingest.actions import ActionLayout, Kind, layout_of
+from rsjax.tools.ingest.actions import ActionLayout, Kind, described_layout, layout_of
 from rsjax.tools.ingest.episode import LEAVE_OUT, Episode, EpisodeError, EpisodeRef, SourceError, checked, fingerprint
 from rsjax.tools.ingest.pictures import ArrayFrames
 
@@ -30,9 +31,10 @@ def open_source(
     Args:
         path: the store's directory.
         split: the only split to read; "": all.
-        kind: kind of the actions in clips that no simulator of this project made; see
+        kind: kind of the actions in clips that no simulator of this project made, in place of what the store says; see
             :class:`rsjax.tools.ingest.actions.ActionLayout`.
-        held: dimensions of these actions that stay in force, such as a gripper's; None: not declared.
+        held: dimensions of these actions that stay in force, such as a gripper's; None: not declared. If either is
+            given, what the store says does not count.
 
     Raises:
         SourceError: ``path`` is not a complete store of clips, or has no such split.
@@ -66,7 +68,7 @@ class StoreSource:
     held: tuple[int, ...] | None = None
 
     def episodes(self) -> Iterator[EpisodeRef]:
-        """Lists every clip of every split, in the store's order."""
+        """Lists every clip of every split, in the store's order. Clips of one episode are of one recording."""
         declared = (self.kind, self.held)
         key = fingerprint(
             (),
@@ -75,8 +77,11 @@ class StoreSource:
             *([declared] if declared != (None, None) else []),
         )
         for split in self.splits:
-            for number in range(len(self.store.source(split))):
+            source = self.store.source(split)
+            for number in range(len(source)):
                 location = {"split": split, "record": number}
+                if episode := episode_of(source, number):
+                    location["recording"] = f"{split}-{episode}"
                 yield EpisodeRef(f"{split}-{number:06d}", fingerprint((), key, split, number), location)
 
     def read(self, ref: EpisodeRef) -> Episode:
@@ -113,7 +118,12 @@ class StoreSource:
             fps = FPS
             timestamps = np.arange(count) / fps
         width = record["actions"].shape[1]
-        layout = layout_of(record["actions"], self.kind, self.held, (), (), None)
+        described = self.store.manifest.get("action_dimensions") or []
+        layout = None
+        if (self.kind, self.held) == (None, None) and len(described) == width:
+            layout = described_layout(described)
+        if layout is None:
+            layout = layout_of(record["actions"], self.kind, self.held)
         if "control_hz" in provenance:  # a simulator's own: the last dimension of each control step is the gripper
             if width % steps == 0:
                 last = width // steps - 1
@@ -121,6 +131,14 @@ class StoreSource:
                 last = width
             layout = ActionLayout("delta", held=tuple(range(last, width, width // steps or 1)))
         measured = provenance.get("depth_unit", "metres") == "metres" and record.get("depth") is not None
+        meta = {
+            "source": self.store.manifest.get("source", "sim"),
+            "clip": place,
+            "provenance": provenance,
+            "actions": layout.to_json(),
+        }
+        if knows_success(self.store):
+            meta["success"] = np.asarray(record.get("success", []), bool).tolist()
         return Episode(
             id=ref.id,
             fingerprint=ref.fingerprint,
@@ -131,14 +149,16 @@ class StoreSource:
             states=None,
             cameras={camera: ArrayFrames(record["rgb"])},
             depth={camera: ArrayFrames(record["depth"].astype(np.float32))} if measured else {},
-            meta={
-                "source": self.store.manifest.get("source", "sim"),
-                "clip": place,
-                "provenance": provenance,
-                "actions": layout.to_json(),
-                "success": np.asarray(record.get("success", []), bool).tolist(),
-            },
+            meta=meta,
         )
+
+
+def episode_of(source: Source, number: int) -> str:
+    """Returns the episode from which a clip was cut; "" if it does not say so, or cannot be read."""
+    try:
+        return str(source[number]["provenance"]["episode"])
+    except (StoreError, KeyError, TypeError):  # refused when it is read
+        return ""
 
 
 def _check_arrays(record: Record, where: str) -> None:

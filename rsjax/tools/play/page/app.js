@@ -6,7 +6,7 @@ import { makePace } from "./pace.js";
 import { makeTransport } from "./player/transport.js";
 import { applySession, failed, loadLink, send, start, takeFacts, takeFrame, wants } from "./session.js";
 import { makeStarts } from "./starts.js";
-import { at, attempt, banner, note, ready, state } from "./state.js";
+import { at, attempt, banner, hasNewLink, note, ready, state } from "./state.js";
 import { useTheme } from "./ui.js";
 
 const FAST = 1000; // frames a second: as fast as it goes
@@ -53,7 +53,7 @@ function greeted(message) {
   if (!again) build();
   state.parts.starts = starts;
   attempt(state.connection.call("watch", { kinds: watched() }));
-  if (message.returned && (again || !location.hash)) return; // its session follows
+  if (message.returned && (again || !hasNewLink())) return; // its session follows
   if (again) note("The server knows this session no more: it starts again.", true);
   if (location.hash.startsWith("#state=")) loadLink(starts.last());
   else if (message.run.clips || starts.last().upload) beginAgain();

@@ -46,6 +46,11 @@ export function connect({ session, on }) {
 
   function open() {
     clearTimeout(timer);
+    if (socket) {
+      socket.onclose = socket.onmessage = null;
+      socket.close();
+      rejectWaiting();
+    }
     const url = address("/ws", { session: session() });
     url.protocol = url.protocol.replace("http", "ws");
     socket = new WebSocket(url);
@@ -71,9 +76,13 @@ export function connect({ session, on }) {
     else call.resolve(message);
   }
 
-  function close(code, reason) {
+  function rejectWaiting() {
     for (const { reject } of waiting.values()) reject(Object.assign(new Error("the connection was lost"), { code: "lost" }));
     waiting.clear();
+  }
+
+  function close(code, reason) {
+    rejectWaiting();
     if (FINAL.has(code)) {
       on.closed(code, reason);
       return;
@@ -83,27 +92,28 @@ export function connect({ session, on }) {
     timer = setTimeout(open, wait);
   }
 
-  /** Sends a message; returns a promise of its answer, with the message's number as `id`. */
-  function call(type, fields = {}) {
-    const id = next++;
-    const promise = new Promise((resolve, reject) => {
+  function ask(id, data) {
+    return new Promise((resolve, reject) => {
       if (socket?.readyState !== WebSocket.OPEN) {
         reject(Object.assign(new Error("there is no connection"), { code: "lost" }));
         return;
       }
       waiting.set(id, { resolve, reject });
-      socket.send(JSON.stringify({ type, id, ...fields }));
+      socket.send(data);
     });
+  }
+
+  /** Sends a message; returns a promise of its answer, with the message's number as `id`. */
+  function call(type, fields = {}) {
+    const id = next++;
+    const promise = ask(id, JSON.stringify({ type, id, ...fields }));
     promise.id = id;
     return promise;
   }
 
   /** Sends a picture. */
   function upload(blob) {
-    return new Promise((resolve, reject) => {
-      waiting.set(0, { resolve, reject });
-      socket.send(blob);
-    });
+    return ask(0, blob);
   }
 
   open();

@@ -1,7 +1,7 @@
 // What is kept: a video, clips of a store, and a link.
 import { address } from "./connection.js";
 import { element } from "./player/dom.js";
-import { note } from "./state.js";
+import { note, rememberLink } from "./state.js";
 
 function select(name, values) {
   return element("select", { "aria-label": name }, ...values.map(([value, text]) => element("option", { value }, text)));
@@ -58,9 +58,9 @@ export function makeKeep({ host, call, view, fps }) {
     const url = new URL(location.href);
     url.hash = `state=${state}`;
     history.replaceState(null, "", url);
-    await navigator.clipboard?.writeText(url.href).then(
-      () => note("the link is copied: it makes these frames again, bit for bit"),
-      () => note("the link stands in the address bar: it makes these frames again, bit for bit"),
-    );
+    rememberLink(url.hash);
+    // There is no clipboard over plain http, except from the loopback address.
+    const copied = await navigator.clipboard?.writeText(url.href).then(() => true, () => false);
+    note(`the link ${copied ? "is copied" : "stands in the address bar"}: it makes these frames again, bit for bit`);
   }
 }

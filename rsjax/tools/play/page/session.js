@@ -1,6 +1,6 @@
 // The session: its start, its steps and its branches.
 import { askAgain, drawStep, expect, layout, redraw, watched } from "./drawing.js";
-import { at, attempt, lastFrame, note, ready, state, tree } from "./state.js";
+import { at, attempt, lastFrame, note, ready, rememberLink, state, tree } from "./state.js";
 
 /** Starts from a clip or the last upload. */
 export function start(fields) {
@@ -9,8 +9,10 @@ export function start(fields) {
 
 /** Makes the frames of the link in this page's address again. */
 export async function loadLink(otherwise) {
-  const made = await begin("load", { state: location.hash.slice("#state=".length) });
-  if (!made && !state.session) start(otherwise);
+  const { hash } = location;
+  const made = await begin("load", { state: hash.slice("#state=".length) });
+  if (made) rememberLink(hash);
+  else if (!state.session) start(otherwise);
 }
 
 async function begin(type, fields) {

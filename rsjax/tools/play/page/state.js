@@ -2,6 +2,8 @@
 import { makeTree } from "./tree.js";
 import { kept, makeBanner, makeNotes } from "./ui.js";
 
+const LINK = "rsjax-link"; // the link that this window has loaded or made, which a reload need not load again
+
 export const at = (id) => document.getElementById(id);
 export const note = makeNotes(at("notes"));
 export const banner = makeBanner(at("banner"));
@@ -32,6 +34,16 @@ export function ready() {
 /** Returns the last frame of the current branch. */
 export function lastFrame() {
   return tree.length(state.current) - 1;
+}
+
+/** Remembers that this window's session has come from a link, or is kept in it. */
+export function rememberLink(hash) {
+  sessionStorage.setItem(LINK, hash);
+}
+
+/** Returns whether the page's address has another link than the one that this window has loaded or made. */
+export function hasNewLink() {
+  return location.hash !== "" && location.hash !== sessionStorage.getItem(LINK);
 }
 
 /** Returns a promise's value; null where it failed, after saying why. */

@@ -46,7 +46,7 @@ def test_an_episode_in_a_folder(tmp_path: Path) -> None:
     write_episode(tmp_path)
     segments = [{"start": 3, "end": 8, "text": "put"}, {"start": 0, "end": 3, "text": "take", "skill": "pick"}]
     (tmp_path / "one/episode.json").write_text(json.dumps({"task": "tidy up", "segments": segments}))
-    (episode,) = read_all("folder", tmp_path, kind="absolute", held=[1])
+    (episode,) = read_all("folder", tmp_path, kind="absolute", held=[1], angles=[0])
     assert (episode.id, episode.task, list(episode.cameras)) == ("one", "tidy up", ["front", "wrist"])
     assert episode.fps == pytest.approx(10)
     assert numbers_of(episode.cameras["front"].read(range(COUNT))) == list(range(COUNT))
@@ -58,7 +58,7 @@ def test_an_episode_in_a_folder(tmp_path: Path) -> None:
     np.testing.assert_allclose(episode.timestamps, np.arange(COUNT) / 10)
     assert [(s.start, s.end, s.text, s.skill) for s in episode.segments] == [(0, 3, "take", "pick"), (3, 8, "put", "")]
     assert episode.meta["action_names"] == ["action_x", "action_grip"]
-    assert ActionLayout.from_json(episode.meta["actions"]) == ActionLayout("absolute", held=(1,))
+    assert ActionLayout.from_json(episode.meta["actions"]) == ActionLayout("absolute", held=(1,), angles=(0,))
 
 
 @pytest.mark.parametrize("kind", ["csv", "parquet", "npy", "one row less"])
@@ -84,8 +84,7 @@ def test_rows_that_led_into_their_frame(tmp_path: Path) -> None:
     write_episode(tmp_path)
     (tmp_path / "dataset.json").write_text('{"after": true, "task": "go"}')
     (episode,) = read_all("folder", tmp_path)
-    np.testing.assert_array_equal(episode.actions[1:], ACTIONS[1:])
-    assert not episode.actions[0].any()
+    np.testing.assert_array_equal(episode.actions, ACTIONS)
     assert episode.task == "go"
 
 

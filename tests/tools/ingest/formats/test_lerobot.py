@@ -210,13 +210,12 @@ def test_pictures_in_the_table(tmp_path: Path) -> None:
     assert numbers_of(read_all("lerobot", root)[1].cameras["image"].read([8, 1])) == [14, 7]
 
 
-def test_deltas_are_declared_and_not_guessed(tmp_path: Path) -> None:
+def test_what_actions_are_is_declared_and_not_guessed(tmp_path: Path) -> None:
     write_v2(tmp_path)
     (episode, *_) = read_all("lerobot", tmp_path)
-    assert episode.meta["actions"]["kind"] == "absolute" and episode.meta["action_names"] == ["x", "grip"]
-    path = tmp_path / "meta/info.json"
-    path.write_text(path.read_text().replace('["x", "grip"]', '["delta_x", "grip"]'))
-    assert read_all("lerobot", tmp_path)[1].meta["actions"]["kind"] == "undeclared"
+    assert episode.meta["actions"]["kind"] == "undeclared" and episode.meta["action_names"] == ["x", "grip"]
+    turns = read_all("lerobot", tmp_path, kind="absolute", angles=[0])[0].meta["actions"]
+    assert turns == {"kind": "absolute", "held": [], "quaternions": [], "angles": [0]}
     declared = read_all("lerobot", tmp_path, kind="delta")[1].meta["actions"]
     assert declared["unclear"] == ["dimension 1 (grip) is never anything but 1"]
     assert read_all("lerobot", tmp_path, kind="delta", held=[1])[1].meta["actions"] == {

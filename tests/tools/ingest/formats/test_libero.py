@@ -39,9 +39,12 @@ def test_an_action_stands_with_the_frame_that_was_recorded_after_it(tmp_path: Pa
     episode = read_first("libero", path)
     assert episode.cameras["agentview"].read(range(4))[:, 3, 3, 0].tolist() == [10, 11, 12, 13]
     # Action t of the file is t + 1 and led into frame t; the first one's start was not recorded.
-    np.testing.assert_array_equal(episode.actions[:, 0], [0, 2, 3, 4])
+    np.testing.assert_array_equal(episode.actions[:, 0], [1, 2, 3, 4])
     np.testing.assert_array_equal(np.asarray(episode.states)[:, 0], [0, 10, 20, 30])
     assert episode.fps == 20.0
+    before = read_first("libero", path, after=False)
+    np.testing.assert_array_equal(before.actions[:, 0], [0, 1, 2, 3])
+    assert before.task == episode.task == "a"
 
 
 def test_the_same_file_is_one_off_from_robomimic(tmp_path: Path) -> None:

@@ -55,8 +55,9 @@ def test_other_names_and_options(tmp_path: Path) -> None:
         assert (episode.fps, episode.task, episode.depth, episode.states) == (5.0, "push", {}, None)
         np.testing.assert_array_equal(episode.actions[:, 0], [0, 1, 2, 3, 4])
         assert episode.meta["actions"] == {"kind": "absolute", "held": [1], "quaternions": []}
-    after = read_first("npz", tmp_path / "0.npz", **options, after=True)
-    np.testing.assert_array_equal(after.actions[:, 0], [0, 2, 3, 4, 5])
+    after = read_first("npz", tmp_path / "0.npz", **options, after=True, angles=[0])
+    np.testing.assert_array_equal(after.actions[:, 0], [1, 2, 3, 4, 5])
+    assert after.meta["actions"]["angles"] == [0]
 
 
 @settings(max_examples=30)

@@ -33,7 +33,7 @@ def test_a_key_map_of_ones_own(tmp_path: Path) -> None:
     (tmp_path / "map.json").write_text(json.dumps(keys))
     episode = read_first("rlds", tmp_path / "data", keys=str(tmp_path / "map.json"))
     assert list(episode.cameras) == ["front"] and episode.fps == 2 and episode.states is None
-    np.testing.assert_array_equal(episode.actions[:, 0], [0, 2, 3, 4, 5])  # recorded with the frame they led into
+    np.testing.assert_array_equal(episode.actions[:, 0], [1, 2, 3, 4, 5])  # recorded with the frame they led into
 
 
 def test_a_key_map_that_does_not_say_what_actions_are_leaves_them_undeclared(tmp_path: Path) -> None:
@@ -49,8 +49,8 @@ def test_the_poses_that_the_hand_reached_are_actions_by_name(tmp_path: Path) -> 
     write_bridge(tmp_path / "data", [bridge_episode()])
     episode = read_first("rlds", tmp_path / "data", keys="bridge_poses")
     assert episode.states is not None
-    np.testing.assert_array_equal(episode.actions[1:], episode.states[1:])
-    assert episode.meta["actions"]["kind"] == "absolute"
+    np.testing.assert_array_equal(episode.actions, episode.states)
+    assert (episode.meta["actions"]["kind"], episode.meta["actions"]["angles"]) == ("absolute", [3, 4, 5])
 
 
 def test_every_named_map_is_whole() -> None:

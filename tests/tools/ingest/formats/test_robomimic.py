@@ -115,3 +115,23 @@ def test_the_controller_says_whether_commands_are_steps(tmp_path: Path, controll
     arguments = {"env_kwargs": {"controller_configs": controller}}
     path = write_demos(tmp_path / "a.hdf5", {"demo_0": demo()}, env_args=arguments)
     assert read_first("robomimic", path).meta["actions"] == {"kind": kind, "held": [6], "quaternions": []}
+    own = write_demos(tmp_path / "b.hdf5", {"demo_0": demo()}, env_info={"controller_configs": controller})
+    assert read_first("robomimic", own).meta["actions"]["kind"] == kind
+
+
+def test_what_is_declared_replaces_what_the_controller_says(tmp_path: Path) -> None:
+    path = write_demos(tmp_path / "a.hdf5", {"demo_0": demo()}, env_args=ENVIRONMENT)
+    declared = read_first("robomimic", path, kind="absolute", held=[0, 6])
+    assert declared.meta["actions"] == {"kind": "absolute", "held": [0, 6], "quaternions": []}
+    assert declared.fingerprint != read_first("robomimic", path).fingerprint
+    with pytest.raises(EpisodeError):
+        read_first("robomimic", path, held=[7])
+
+
+def test_a_demo_that_several_files_have_is_one_recording(tmp_path: Path) -> None:
+    demos = {f"demo_{number}": demo() | {"states": np.full((4, 3), number)} for number in range(2)}
+    for name in ("image", "low_dim"):
+        write_demos(tmp_path / f"{name}.hdf5", demos)
+    write_demos(tmp_path / "other.hdf5", {"demo_0": demo()})
+    *shared, other = [ref.location["recording"] for ref in open_source("robomimic", tmp_path).episodes()]
+    assert shared[:2] == shared[2:] and len({*shared, other}) == 3 and other == "other-demo_0"

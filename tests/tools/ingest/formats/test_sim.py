@@ -23,8 +23,10 @@ def clip(number: int = 0, **changes: object) -> Record:
     } | changes
 
 
-def write(path: Path, *clips: Record) -> Path:
-    write_store(path, "clips", {"train": clips[:1], "test": clips[1:]}, {"key": "k", "config": {"control_steps": 2}})
+def write(path: Path, *clips: Record, **more: object) -> Path:
+    """Args: more: fields of the manifest."""
+    meta = {"key": "k", "config": {"control_steps": 2}, "success_share": 1.0} | more
+    write_store(path, "clips", {"train": clips[:1], "test": clips[1:]}, meta)
     return path
 
 
@@ -52,6 +54,23 @@ def test_a_clip_cut_from_a_recording_keeps_its_times(tmp_path: Path) -> None:
     uneven = cut | {"frames": [30, 45, 60, 65], "times": [1.0, 1.5, 2.0, 2.5]}
     episode = read_first("sim", write(tmp_path / "uneven", clip(provenance=uneven)))
     np.testing.assert_allclose(episode.timestamps, [0, 0.5, 1, 1.5])
+
+
+def test_the_store_says_what_actions_are_and_whether_success_is_known(tmp_path: Path) -> None:
+    lines = ["x (absolute)", "yaw (absolute, an angle)", *["grip (held)"] * 12]
+    path = write(tmp_path / "store", clip(provenance={}), action_dimensions=lines, success_share=None)
+    meta = read_first("sim", path).meta
+    layout = {"kind": "absolute", "held": list(range(2, 14)), "quaternions": [], "angles": [1]}
+    assert meta["actions"] == layout and "success" not in meta
+    declared = read_first("sim", path, held=[]).meta["actions"]
+    assert declared == {"kind": "undeclared", "held": [], "quaternions": []}
+
+
+def test_clips_of_one_episode_are_of_one_recording(tmp_path: Path) -> None:
+    clips = [clip(number, provenance={"episode": name}) for number, name in enumerate(["a", "a", "b", "b"])]
+    source = open_source("sim", write(tmp_path / "store", *clips, clip(provenance={})))
+    recordings = [ref.location.get("recording") for ref in source.episodes()]
+    assert recordings == ["train-a", "test-a", "test-b", "test-b", None]
 
 
 def test_a_clip_without_depth_has_none(tmp_path: Path) -> None:
