@@ -20,7 +20,7 @@ class StepContext(NamedTuple):
     """Inputs of a loss besides parameters, batch and key.
 
     Attributes:
-        step: the number of steps before this one; -1 in validation, which is none.
+        step: the number of steps before this one; -1 in validation, which is no step.
         extra: what the model carries from step to step.
         axis_name: pmap's axis over which the batch is split; None if XLA sees the whole batch.
     """

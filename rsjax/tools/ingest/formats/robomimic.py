@@ -167,8 +167,8 @@ class DemoSource:
     def episodes(self) -> Iterator[EpisodeRef]:
         """Lists each file's demos by their numbers. A file that cannot be read is one entry, which ``read`` refuses.
 
-        Several files of a folder may have the same demo: as states, as pictures, with other actions. Demos that begin
-        in the same simulator state count as one recording, so that they go to one split.
+        Several files of a folder may have the same demo: as states, as pictures, with other actions. Demos with the
+        same simulator states count as one recording, so that they go to one split.
         """
         declared = (self.kind, self.held)
         for file in self.files:
