@@ -258,8 +258,8 @@ class TransformerConfig:
     blocks: int = 32  # of each branch
     heads: int = 8  # of each attention; more where a head would be wider than 64 channels
     # bfloat16: operands of linear layers (accumulated in float32) and of attention within frames of 128 cells or more;
-    # on an accelerator also the features between layers. Parameters, norms' statistics, softmaxes and the loss stay
-    # float32. CPUs without bf16 units still multiply linear layers in float32, which is faster there.
+    # on an accelerator also the features between layers. Parameters, norms' statistics, logits, softmaxes and the loss
+    # stay float32. CPUs without bf16 units still multiply linear layers in float32, which is faster there.
     compute_dtype: Literal["float32", "bfloat16"] = "float32"
     unroll: int = runtime(1)  # blocks per iteration of the scan; more are faster on a CPU and compile longer
     # What the backward pass recomputes. none: nothing. blocks: everything but each block's inputs and a depth block's

@@ -378,10 +378,11 @@ class Transformer(nn.Module):
         if cfg.public.mup:
             x = x / (cfg.width / MUP_WIDTH)
         bf16 = cfg.compute_dtype == "bfloat16"
-        logits = Dense(coarse**2 * cfg.vocabularies * cfg.vocabulary_size, bf16, name=f"{modality}_head")(x)
+        head = Dense(coarse**2 * cfg.vocabularies * cfg.vocabulary_size, bf16, name=f"{modality}_head")
+        logits = head(x.astype(jnp.float32))  # bf16 features would round them to three digits
         if coarse > 1:
             logits = split(logits, coarse)
-        return logits.astype(jnp.float32).reshape(*logits.shape[:-1], cfg.vocabularies, cfg.vocabulary_size)
+        return logits.reshape(*logits.shape[:-1], cfg.vocabularies, cfg.vocabulary_size)
 
     def init_params(self, key: Array) -> Params:
         """Returns fresh parameters; blocks are stacked along a leading axis."""

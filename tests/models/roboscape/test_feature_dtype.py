@@ -47,5 +47,8 @@ def test_a_program_for_a_gpu_has_features_in_bf16() -> None:
     operands = random_params(WIDE), *random_inputs(WIDE)
     clips, frames = random_inputs(WIDE)[1].shape[:2]
     features = f"tensor<{clips}x{frames}x{WIDE.grid**2}x{WIDE.width}xbf16>"
-    assert features in lowered(run, operands, "cuda")
+    program = lowered(run, operands, "cuda")
+    assert features in program
     assert features not in lowered(run, operands, "cpu")
+    logits = f"tensor<{clips * frames * WIDE.grid**2}x{WIDE.vocabularies * WIDE.vocabulary_size}x"
+    assert f"{logits}f32>" in program and f"{logits}bf16>" not in program
