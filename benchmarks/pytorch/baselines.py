@@ -11,7 +11,7 @@ from typing import Any
 
 import jax
 
-from rsjax.config import Config, ConfigError, require
+from rsjax.config import Config, ConfigError, TokenModelConfig, require
 from rsjax.errors import UserError
 from rsjax.models.cogvideox.config import CogVideoXConfig
 from rsjax.models.roboscape.architecture import Architecture
@@ -20,6 +20,7 @@ from rsjax.tools.bench.timing import median_seconds
 # Options that the plain Genie lacks, of the model and of its departures.
 OPTIONS = ("qk_norm", "mup")
 DEPARTURES = ("more_norms", "read_previous", "rotary")
+PARTS = ("second_view", "state_heads", "motion_head")  # of the network
 
 
 def check_genie(config: Config) -> None:
@@ -31,6 +32,13 @@ def check_genie(config: Config) -> None:
     options |= {f"model.departures.{name}": getattr(model.departures, name) for name in DEPARTURES}
     for name, is_on in options.items():
         require(not is_on, f"{name} is on, {plain}, without it; set it to False, {cure}")
+    for name in PARTS:
+        require(not getattr(model, name), f"the network has {name}, {plain}, without it; switch it off, {cure}")
+    assert isinstance(config.model, TokenModelConfig)
+    encoder = config.model.action_encoder
+    require(encoder != "norms", f"model.action_encoder is {encoder}, {plain}; choose linear or mlp, {cure}")
+    guidance = config.model.sample.guidance
+    require(guidance == 1, f"model.sample.guidance is {guidance}, {plain}; set it to 1, {cure}")
 
 
 def check_cogvideox(config: Config) -> None:

@@ -61,7 +61,7 @@ class GenieTorch(nn.Module):
     """Maps tokens (B, T, S) and actions (B, T, A) to logits (B, T, S, n, V); the public Genie reads no actions.
 
     Args:
-        config: passes :func:`benchmarks.pytorch.baselines.check_plain`.
+        config: passes :func:`benchmarks.pytorch.baselines.check_genie`.
     """
 
     def __init__(self, config: Architecture) -> None:

@@ -138,7 +138,7 @@ PROTOCOLS = {
             PAPER,
             name="contacts",
             splits=("contacts_*",),
-            origin="here: held-out grasps, pushes, slips, free driving and attempts of bad policies",
+            origin="here: held-out grasps, pushes, slips, free driving, bad policies and clips from the middle",
         ),
     )
 }

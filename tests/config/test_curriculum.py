@@ -26,16 +26,20 @@ from tests.curricula import PAPER, mixed, stage
 
 WORDS = st.text(min_size=1, max_size=5)
 POSITIVE = st.floats(1e-6, 1e6)
-PARTS = st.builds(
-    ComponentConfig,
-    tasks=st.lists(WORDS, min_size=1).map(tuple),
-    difficulties=st.lists(WORDS, min_size=1).map(tuple),
-    scenes=st.lists(WORDS, min_size=1).map(tuple),
-    store=st.sampled_from(["", "runs/b/tokens/store", "/data/a=b"]),
-    weight=POSITIVE,
-    clips=st.integers(0, 1000),
+FILTERS = {
+    "tasks": st.lists(WORDS, min_size=1).map(tuple),
+    "difficulties": st.lists(WORDS, min_size=1).map(tuple),
+    "scenes": st.lists(WORDS, min_size=1).map(tuple),
+    "weight": POSITIVE,
+    "clips": st.integers(0, 1000),
+}
+PARTS = st.one_of(
+    st.builds(ComponentConfig, **FILTERS, store=st.sampled_from(["", "runs/b/tokens/store", "/data/a=b"])),
+    st.builds(ComponentConfig, **FILTERS, annotations=st.sampled_from(["estimated_tracks", "estimated"])),
 )
-STAGES = st.builds(CurriculumStageConfig, st.lists(PARTS, min_size=1).map(tuple), POSITIVE, st.booleans())
+STAGES = st.builds(
+    CurriculumStageConfig, st.lists(PARTS, min_size=1).map(tuple), POSITIVE, st.booleans(), st.sampled_from([0, 2, 9])
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,9 +100,12 @@ def test_the_papers_curriculum_on_the_command_line_and_in_a_file(tmp_path: Path)
 
 def test_an_entry_can_set_every_field() -> None:
     kitchens = {"tasks": ["pick*"], "difficulties": ["simple"], "scenes": ["kitchen*"], "store": "runs/b", "clips": 9}
-    assert read_curriculum(json.dumps([kitchens | {"weight": 2.5, "epochs": 0.5, "restart": True}])) == (
-        stage("simple", 0.5, restart=True, tasks=("pick*",), scenes=("kitchen*",), store="runs/b", weight=2.5, clips=9),
+    whole = stage(
+        "simple", 0.5, restart=True, tasks=("pick*",), scenes=("kitchen*",), store="runs/b", weight=2.5, clips=9
     )
+    entry = kitchens | {"weight": 2.5, "epochs": 0.5, "restart": True, "frames": 4}
+    assert read_curriculum(json.dumps([entry])) == (dataclasses.replace(whole, frames=4),)
+    assert read_curriculum('[{"annotations": "estimated"}]') == (stage(annotations="estimated"),)
     components = [{"difficulties": ["a"], "weight": 1.0}, {"difficulties": ["b"], "weight": 2.0}]
     assert read_curriculum(json.dumps([{"components": components}])) == (mixed({"a": 1.0, "b": 2.0}),)
 

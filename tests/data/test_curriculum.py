@@ -203,6 +203,8 @@ def test_a_stage_of_few_frames_reads_the_first_ones() -> None:
     second = np.arange(6 * 4 * 4).reshape(6, 4, 4)
     objects = {"height": [0.1 * t for t in range(6)], "opening": [0.0] * 6, "cube_width": 3.0}
     record = record | {"depth": None, "second": second, "provenance": record["provenance"] | {"objects": objects}}
+    shifted = np.stack([record["rgb"] + 1, record["rgb"] + 2])
+    record = record | {"success": np.arange(6) > 2, "rgb_shifted": shifted, "depth_shifted": shifted + 2}
     cut = first_frames(lambda record, rng: record, 4, record, np.random.default_rng(0))
     assert cut["rgb"].tolist() == record["rgb"][:4].tolist()
     assert cut["actions"].tolist() == record["actions"][:4].tolist()
@@ -210,6 +212,9 @@ def test_a_stage_of_few_frames_reads_the_first_ones() -> None:
     assert cut["visible"].tolist() == record["visible"][:, :4].tolist()
     assert cut["depth"] is None
     assert cut["second"].tolist() == second[:4].tolist()
+    assert cut["rgb_shifted"].tolist() == shifted[:, :4].tolist()
+    assert cut["depth_shifted"].tolist() == (shifted + 2)[:, :4].tolist()
+    assert state_labels(cut)[:, 0].tolist() == [0, 0, 0, 1]
     np.testing.assert_array_equal(state_labels(cut)[:, 1:], state_labels(record)[:4, 1:])
     assert cut["provenance"]["objects"]["cube_width"] == 3.0 and len(objects["height"]) == 6
     with pytest.raises(StoreError) as caught:

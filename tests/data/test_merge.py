@@ -31,6 +31,7 @@ def test_merged_stores_have_all_records_and_the_units_of_all(tmp_path: Path, cou
     store = merge([tmp_path / "a", tmp_path / "b"], tmp_path / "c")
     assert numbers(store) == [0, 1, 2, 3, 10, 11, 12] and numbers(store, "test") == [90, 91, 90, 91]
     assert store.manifest["depth_range"] == [0.5, 2.0]
+    assert store.manifest["success_share"] == pytest.approx(5 / 11)  # of numbers 0, 3, 90, 12 and 90
     source = store.source("train")
     records = [source[i] for i in range(len(source))]
     assert all(record["provenance"]["depth_range"] == [0.5, 2.0] for record in records)
@@ -47,9 +48,9 @@ def test_a_split_by_label_holds_each_record_once_and_merges_back(tmp_path: Path)
         "simple": [0, 2, 4, 6],
         "difficult": [1, 3, 5],
     }
+    assert [store.manifest["success_share"] for store in parts.values()] == [3 / 5, 1 / 4]  # 0, 6 and 90; 3
     for store in parts.values():
         assert store.manifest["action_mean"] == whole.manifest["action_mean"]
-        assert store.manifest["success_share"] == 0
         assert_labels_are_those_of_the_records(store)
     back = merge(list(parts), tmp_path / "b")
     assert sorted(numbers(back)) == list(range(7))

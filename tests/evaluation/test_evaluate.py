@@ -12,8 +12,8 @@ from rsjax.data.store import Store, StoreError
 from rsjax.errors import UserError
 from rsjax.evaluation import evaluate as evaluation
 from rsjax.evaluation.evaluate import EvaluationClips, evaluate
-from rsjax.evaluation.generation import ClipBatch, Generation, rolled_out
-from rsjax.evaluation.metrics.delta_psnr import other_clips
+from rsjax.evaluation.generation import ClipBatch, Generation, rolled_out, with_baselines
+from rsjax.evaluation.metrics.delta_psnr import action_range, other_clips, uniform_actions
 from rsjax.evaluation.metrics.psnr import psnr as pixels
 from rsjax.evaluation.protocols import PAPER, find, of_run
 from rsjax.evaluation.registry import metrics
@@ -82,6 +82,15 @@ def test_the_baselines_are_plain_numpys(clips: Store, result: Evaluation) -> Non
     assert result.metrics["depth_absrel_tokenizer"] == pytest.approx(abs_rel(TRUTH["depth"], depth), rel=1e-4)
 
 
+def test_the_last_frame_of_a_longer_prompt_is_repeated(clips: Store, trained: TrainedModel) -> None:
+    recorded = EvaluationClips.read(clips, "test", of_run(trained.config), trained.config.clips).clips
+    still = with_baselines(trained, recorded, recorded.video, prompt_frames=3)["_repeat_first"]
+    assert still.depth is not None
+    for frame in range(TRUTH["rgb"].shape[1]):
+        np.testing.assert_array_equal(still.rgb[:, frame], TRUTH["rgb"][:, 2])
+        np.testing.assert_array_equal(still.depth[:, frame], TRUTH["depth"][:, 2])
+
+
 def test_batches_with_a_filled_up_last_one_score_as_one_batch_does(trained: TrainedModel, result: Evaluation) -> None:
     """5 clips in batches of 2 against one batch of 5; ΔPSNR with the same key under other clips' actions."""
     own = generated(trained, TRUTH["actions"])
@@ -92,6 +101,11 @@ def test_batches_with_a_filled_up_last_one_score_as_one_batch_does(trained: Trai
     worse = [psnr(TRUTH["rgb"], generated(trained, TRUTH["actions"][order]).rgb) for order in others]
     assert result.metrics["delta_psnr"] == pytest.approx(psnr(TRUTH["rgb"], own.rgb) - np.mean(worse), abs=1e-4)
     assert result.metrics["delta_psnr"] != 0
+    low, high = action_range(np.stack([toy.clip(number).actions for number in range(toy.TRAIN)]))
+    uniform = uniform_actions(TRUTH["actions"], low, high, draws=2, seed=0)
+    worse = [psnr(TRUTH["rgb"], generated(trained, actions).rgb) for actions in uniform]
+    expected = psnr(TRUTH["rgb"], own.rgb) - np.mean(worse)
+    assert result.metrics["delta_psnr_uniform"] == pytest.approx(expected, abs=1e-4)
 
 
 def test_own_actions_in_place_of_random_ones_make_no_difference(clips: Store, monkeypatch: pytest.MonkeyPatch) -> None:

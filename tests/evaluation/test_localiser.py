@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from rsjax.clip import Video
+from rsjax.evaluation.evaluate import locating
 from rsjax.evaluation.localiser import Localiser, recorded_places, train_localiser, varied
 from rsjax.evaluation.metrics.localisation import cube_error, gripper_error, lifted_accuracy
-from rsjax.evaluation.registry import Located, Places, Scene, Unavailable
+from rsjax.evaluation.registry import Scene, Unavailable
 
 SIDE, WIDTH, FRAMES = 16, 4, 8
 
@@ -32,17 +33,11 @@ def localiser() -> Localiser:
     return train_localiser([clip(seed) for seed in range(100)], steps=75)
 
 
-def located(clips: list[dict[str, Any]], localiser: Localiser, shown: np.ndarray) -> Located:
-    recorded = recorded_places(clips)
-    assert recorded is not None
-    places, width = recorded
-    last = Places(places.xy[:, -1], places.lifted[:, -1])
-    return Located(last, width, localiser(np.stack([each["rgb"][-1] for each in clips])), localiser(shown))
-
-
 def scene(clips: list[dict[str, Any]], localiser: Localiser, shown: np.ndarray) -> Scene:
+    """A scene whose video ends with these frames."""
     video = Video(np.stack([each["rgb"] for each in clips]))
-    return Scene(video, video, located=located(clips, localiser, shown))
+    locate = locating(localiser, clips, FRAMES - 1)
+    return Scene(video, video, located=locate(Video(shown[:, None]), True))
 
 
 def test_places_are_read_within_a_fraction_of_a_width(localiser: Localiser) -> None:

@@ -64,7 +64,10 @@ def test_training_clips_have_tokens_of_moved_copies_in_a_set_of_their_own(tmp_pa
     assert "shifts" not in moved_too.source("test")[0]
     record, clip = moved_too.source("train")[1], clips.source("train")[1]
     np.testing.assert_array_equal(record["rgb"], plain.source("train")[1]["rgb"])
-    for number, move in enumerate(np.round(record["shifts"] * size).astype(int)):
+    moves = np.round(record["shifts"] * size).astype(int)
+    assert moves.shape == (2, 2) and moves.any(axis=1).all()
+    assert (moved_too.source("train")[0]["shifts"] != record["shifts"]).any(), "each clip has its own"
+    for number, move in enumerate(moves):
         assert abs(move).max() <= 3
         np.testing.assert_array_equal(record["rgb_shifted"][number], codec.encode_rgb(moved(clip["rgb"], *move)))
         np.testing.assert_array_equal(record["depth_shifted"][number], codec.encode_depth(moved(clip["depth"], *move)))

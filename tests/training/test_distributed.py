@@ -153,8 +153,8 @@ def test_one_process_stays_alone(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_launch_files_use_options_of_the_command() -> None:
     job = list(yaml.safe_load_all((ROOT / "launch/kubernetes.yaml").read_text()))[1]["spec"]
     command = job["template"]["spec"]["containers"][0]["command"][-1].replace("$JOB_COMPLETION_INDEX", "1")
-    program, *arguments = shlex.split(command.partition(" -m ")[2])
-    assert program == "experiments.train"
+    start, program, action, *arguments = shlex.split(command)
+    assert (start, program, action) == ("exec", "rsjax", "train")
     config, options = parse(arguments, program, "", Options())
     assert (config.runtime.sharding, config.runtime.fsdp) == ("mesh", 8)
     assert (options.coordinator, options.processes, options.process_id) == ("rsjax-train-0.rsjax:8476", 2, 1)

@@ -191,13 +191,18 @@ def test_sigterm_before_the_first_step_has_nothing_to_save(tmp_path: Path) -> No
 def test_validation_scores_are_logged_drawn_and_decide_which_checkpoints_are_kept(
     whole: tuple[TrainState, list[dict[str, Any]]], tmp_path: Path
 ) -> None:
+    looked = []
+
     def look(step: int, weights: Any) -> Validation:
+        looked.append(jax.tree.map(np.array, weights))
         return Validation(
             abs(step - 4.0), {"validation/loss": abs(step - 4.0)}, {"seen": np.zeros((2, 2, 3), np.uint8)}
         )
 
     loop = replace(LOOP, eval_every=2, checkpoint_every=2, keep_last=1)
-    assert_same(train(loop, tmp_path, per_step=("clips", 2), validate=look), whole[0])
+    state = train(loop, tmp_path, per_step=("clips", 2), validate=look)
+    assert_same(state, whole[0])
+    jax.tree.map(np.testing.assert_array_equal, looked[-1], state.ema)
     rows = [row for row in read_log(tmp_path) if "validation/loss" in row]
     assert [(row["step"], row["validation/loss"]) for row in rows] == [(2, 2), (4, 0), (6, 2), (8, 4), (9, 5)]
     assert len(list((tmp_path / "pictures").glob("seen-*.png"))) == 5

@@ -120,7 +120,8 @@ def write_videos(
                 depth = {"true_depth": clip["depth"][:shown], "predicted_depth": made.depth[0]}
             unit = clip["provenance"].get("depth_unit") or "metres"
             sides = {"truth": clip["rgb"][:shown], "prediction": made.rgb[0], **depth}
-            write(path, animation(ClipFigure(title=f"clip {number}", **sides, depth_unit=unit)), fps, 1, GENERATED_MARK)
+            figure = ClipFigure(f"clip {number}", **sides, prompt_frames=config.prompt_frames, depth_unit=unit)
+            write(path, animation(figure), fps, 1, GENERATED_MARK)
         yield path
 
 
@@ -151,8 +152,15 @@ def write_demo(model: Path, data_dir: Path, out: Path, number: int | None = None
     depth = {}
     if videos.depth is not None:
         depth = {"true_depth": clip["depth"], "predicted_depth": videos.depth[0]}
-    title = f"clip {number}: {clip['task']}"
-    figure = ClipFigure(title, clip["rgb"], videos.rgb[0], other_actions=videos.rgb[1], **depth)
+    figure = ClipFigure(
+        f"clip {number}: {clip['task']}",
+        clip["rgb"],
+        videos.rgb[0],
+        other_actions=videos.rgb[1],
+        **depth,
+        prompt_frames=seen,
+        depth_unit=clip["provenance"].get("depth_unit") or "metres",
+    )
     video = out / f"clip-{number}.mp4"
     strip = video.with_suffix(".png")
     write_mp4(video, animation(figure), DEMO_FPS, comment=GENERATED_MARK)

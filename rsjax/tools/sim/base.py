@@ -36,6 +36,17 @@ class MujocoSim:
         self._renderer.close()
         self._env.close()
 
+    def check_stable(self) -> None:
+        """Raises :class:`ArithmeticError` if the simulation has diverged since the last reset.
+
+        MuJoCo then begins anew by itself, from positions that are finite; only its warnings tell.
+        """
+        from mujoco import mjtWarning
+
+        kinds = (mjtWarning.mjWARN_BADQPOS, mjtWarning.mjWARN_BADQVEL, mjtWarning.mjWARN_BADQACC)
+        if any(self._data.warning[int(kind)].number for kind in kinds):
+            raise ArithmeticError("the simulation diverged: MuJoCo met a number that is huge or not finite")
+
     @property
     def camera(self) -> Camera:
         return Camera(

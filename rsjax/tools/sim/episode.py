@@ -254,7 +254,7 @@ def run_episode(sim: Simulator, config: SimConfig, plan: EpisodePlan) -> Clip:
         "camera": config.camera,
         "control_hz": ENVIRONMENTS[config.env].control_hz,
         "expert": manner,
-        "objects": _in_the_image(shots[0].camera, places, sim.object_width) | {"height": heights, "opening": openings},
+        "objects": _in_the_image(shots, places, sim.object_width) | {"height": heights, "opening": openings},
         "versions": {name: importlib.metadata.version(name) for name in (ENVIRONMENTS[config.env].package, "mujoco")},
     }
     if config.env == "metaworld":
@@ -309,9 +309,16 @@ def _replayed(replay: Replay, controls: int, rng: np.random.Generator) -> Callab
     return lambda state: next(steps)
 
 
-def _in_the_image(camera: Camera, places: list[dict[str, Float[np.ndarray, " 3"]]], width: float) -> dict[str, Any]:
+def _in_the_image(
+    shots: list[Snapshot], places: list[dict[str, Float[np.ndarray, " 3"]]], width: float
+) -> dict[str, Any]:
     """Returns (x, y) of object and gripper in each frame, in the units of tracks, and the object's width in frame 0."""
     names = list(places[0])
-    xy, depth = camera.project(np.array([[place[name] for name in names] for place in places]))
+    seen = [
+        shot.camera.project(np.array([place[name] for name in names]))
+        for shot, place in zip(shots, places, strict=True)
+    ]
+    xy = np.array([where for where, _ in seen])
+    distance = float(seen[0][1][0])
     placed = {name: xy[:, k].tolist() for k, name in enumerate(names)}
-    return placed | {f"{names[0]}_width": width / (camera.extent * float(depth[0, 0]))}
+    return placed | {f"{names[0]}_width": width / (shots[0].camera.extent * distance)}

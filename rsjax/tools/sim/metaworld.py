@@ -113,8 +113,7 @@ class MetaworldSim(MujocoSim):
         """
         self.state, _, _, _, info = self._env.step(action)
         self.success = bool(info["success"])
-        if not np.isfinite(self._data.qpos).all():
-            raise ArithmeticError("the simulation diverged: a joint position is not finite")
+        self.check_stable()
 
     @property
     def places(self) -> dict[str, Float[np.ndarray, " 3"]]:

@@ -103,8 +103,7 @@ class PandaSim(MujocoSim):
         self._goal_rotation = Rotation.from_rotvec(TURN * action[3:6]).as_matrix() @ self._goal_rotation
         turn = Rotation.from_matrix(self._goal_rotation).as_rotvec()
         self._env.step(np.concatenate([self._goal, turn, action[6:]]))
-        if not np.isfinite(self._data.qpos).all():
-            raise ArithmeticError("the simulation diverged: a joint position is not finite")
+        self.check_stable()
 
     @property
     def gripper(self) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, "3 3"]]:

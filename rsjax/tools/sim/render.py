@@ -114,6 +114,7 @@ class Renderer:
 
     def close(self) -> None:
         """Frees the OpenGL context."""
+        self._gl.make_current()  # else another renderer's objects, which have the same numbers, would be deleted
         self._context.free()
         self._gl.free()
 

@@ -62,7 +62,8 @@ class TabletopSim(PandaSim):
 
     def __init__(self, task: str = "cube", camera: str = "near", image_size: int = 64) -> None:
         self.task = task
-        self._sizes: list[tuple[float, float]] = []  # of each object: from its origin to its bottom, and to its top
+        self._sizes: list[tuple[float, float]] = []  # from each object's origin to where it is put, and to its top
+        self._resting = np.zeros(len(OBJECTS))  # heights of the objects' origins when the episode begins
         super().__init__(self.scene, [f"{name}_main" for name in OBJECTS], camera, NEAR, image_size)
 
     def scene(self, robosuite: Any, settings: dict[str, Any]) -> Any:
@@ -96,6 +97,7 @@ class TabletopSim(PandaSim):
         mujoco.mj_forward(self._model, self._data)
         for _ in range(SETTLE):
             self.step(rest(OPEN))
+        self._resting = self._data.xpos[self.object_bodies, 2].copy()
 
     @property
     def state(self) -> TabletopState:
@@ -120,8 +122,7 @@ class TabletopSim(PandaSim):
     def success(self) -> bool:
         """Returns whether the task's object lies in the basket and the fingers are open."""
         place = self.places["object"]
-        bottom = place[2] + self._sizes[list(OBJECTS).index(self.task)][0]
-        inside = np.abs(place[:2] - BASKET).max() < INSIDE and bottom < TABLE_HEIGHT + WALL
+        inside = np.abs(place[:2] - BASKET).max() < INSIDE and self.object_height < WALL
         return bool(inside and self.opening > OPENED)
 
     @property
@@ -133,8 +134,7 @@ class TabletopSim(PandaSim):
     @property
     def object_height(self) -> float:
         """Returns the height of the task's object above its place on the table in metres."""
-        bottom, _ = self._sizes[list(OBJECTS).index(self.task)]
-        return float(self.places["object"][2]) + bottom - TABLE_HEIGHT
+        return float(self.places["object"][2] - self._resting[list(OBJECTS).index(self.task)])
 
     @property
     def object_width(self) -> float:

@@ -26,8 +26,11 @@ def toy(**model: Any) -> Config:
         (toy(public_code=PublicCodeConfig(qk_norm=True)), "model.public_code.qk_norm is on"),
         (toy(public_code=PublicCodeConfig(mup=True)), "model.public_code.mup is on"),
         (toy(departures=Departures(rotary=True)), "model.departures.rotary is on"),
+        (toy(state_heads="on"), "the network has state_heads"),
+        (toy(action_encoder="norms"), "model.action_encoder is norms"),
+        (toy(**{"departures.action_dropout": 0.1, "sample.guidance": 2.0}), "model.sample.guidance is 2.0"),
     ],
-    ids=["tiny", "more_norms", "qk_norm", "mup", "rotary"],
+    ids=["tiny", "more_norms", "qk_norm", "mup", "rotary", "state_heads", "norms", "guidance"],
 )
 def test_a_model_that_torch_lacks_is_refused(config: Config, line: str) -> None:
     with pytest.raises(ConfigError, match=line):

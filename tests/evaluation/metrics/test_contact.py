@@ -24,7 +24,8 @@ def scene(prediction: np.ndarray, on_truth: np.ndarray | None = None, success: n
     truth = Video(RNG.integers(0, 256, SHAPE, np.uint8))
     shown = Video(RNG.integers(0, 256, SHAPE, np.uint8))
     gripper = RNG.random((3, FRAMES, 2))
-    drives = Drives(truth, shown, gripper, np.array([0.1, 0.2, 0.4]), gripper, gripper + np.array([0.03, 0.04]))
+    located = gripper + np.arange(1, FRAMES + 1)[:, None] / 48 * np.array([0.03, 0.04])  # 0.05 away in frame 48
+    drives = Drives(truth, shown, gripper, np.array([0.1, 0.2, 0.4]), gripper, located)
     return Scene(truth, shown, probed=Probed(Grasps(OFFSET, success, on_truth, prediction), drives))
 
 
@@ -67,7 +68,8 @@ def test_the_curve_has_the_shares_of_each_offset_in_both_worlds() -> None:
     for name, success in (("contact_simulator", SUCCESS), ("contact_model", p > 0.5)):
         for point, offset in enumerate((0.0, 0.02, 0.04)):
             share = wilson(int(success[offset == OFFSET].sum()), 12)
-            assert (curves[name][point], curves[f"{name}_low"][point]) == (share.value, share.low)
+            found = [curves[f"{name}{edge}"][point] for edge in ("", "_low", "_high")]
+            assert found == [share.value, share.low, share.high]
 
 
 def test_a_drive_s_errors_are_in_widths_of_its_cube_and_baselines_have_curves() -> None:

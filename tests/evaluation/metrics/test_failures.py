@@ -53,6 +53,10 @@ def test_each_failure_is_seen_where_it_is(made: np.ndarray, name: str, shown: bo
     assert nothing_moves == 0
     assert found > 0.7 if shown else found < 0.05
     assert (found > FLAGGED[name]) == shown
+    before = np.full((2, 1, SIZE, SIZE, 3), 30, np.uint8)  # another frame of the prompt
+    videos = [np.concatenate([before, video.rgb], axis=1) for video in (scene.truth, scene.prediction)]
+    later = Scene(Video(videos[0]), Video(videos[1]), prompt_frames=2)
+    np.testing.assert_array_equal(score(name, later), [found, nothing_moves])
 
 
 def test_ghosts_are_pixels_on_the_way_from_before_to_now() -> None:

@@ -50,12 +50,14 @@ def test_psnr_of_masked_pixels_is_its_definition() -> None:
 
 
 def test_the_score_is_the_mean_over_frames_of_clips_that_move() -> None:
-    truth = np.stack([crossing(), np.zeros_like(crossing()), crossing()])
+    resting = np.concatenate([crossing()[:1], crossing()[:-1]])  # at first
+    truth = np.stack([crossing(), np.zeros_like(crossing()), resting])
     made = np.clip(truth.astype(int) + np.array([10, 40, 20])[:, None, None, None, None], 0, 200).astype(np.uint8)
     scene = Scene(Video(truth), Video(made))
     frames, scores = per_frame("psnr_motion", scene), score("psnr_motion", scene)
     assert np.isnan(frames[1]).all()
-    np.testing.assert_allclose(scores, frames[[0, 2]].mean(1))
+    assert np.isfinite(frames[[0, 2]]).sum(1).tolist() == [4, 3]
+    np.testing.assert_allclose(scores, np.nanmean(frames[[0, 2]], axis=1))
     repeated = Scene(Video(truth), Video(np.repeat(truth[:, :1], 5, 1)))
     assert np.mean(score("psnr_motion", repeated)) < np.mean(score("psnr", repeated)[""][[0, 2]])
     with pytest.raises(Unavailable, match="nothing moves in the test clips"):

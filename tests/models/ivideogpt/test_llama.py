@@ -156,8 +156,11 @@ def test_a_rollout_beyond_the_positions_goes_on_with_its_last_frame_as_context()
     assert (made[:, 5] != made[:, 4]).any()
     alone = model.generate(params, assets, prompt[1:], actions[1:]).rgb
     np.testing.assert_allclose(alone.astype(int), made[1:], atol=1)  # batches of two sizes round differently
-    long = model.generate(params, assets, Video(frames(1, 4)), actions[:1, :5]).rgb
+    given = frames(1, 4)
+    long = model.generate(params, assets, Video(given), actions[:1, :5]).rgb
     assert long.shape[1] == 5, "a prompt longer than a sequence"
+    last = model.generate(params, assets, Video(given[:, -1:]), actions[:1, 3:5]).rgb
+    np.testing.assert_allclose(long[:, 4].astype(int), last[:, 1], atol=1)
 
 
 def test_logits_are_those_of_transformers() -> None:

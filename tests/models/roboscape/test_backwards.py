@@ -34,11 +34,13 @@ def test_the_actions_lead_back(record: Record) -> None:
 
 
 def test_frames_and_tracks_turn_together(record: Record) -> None:
+    record = record | {"depth": record["rgb"] + 1, "second": record["rgb"] + 2}
     turned = drawn_direction(ALWAYS, record, np.random.default_rng(0))
-    np.testing.assert_array_equal(turned["rgb"], record["rgb"][::-1])
+    for name in ("rgb", "depth", "second"):
+        np.testing.assert_array_equal(turned[name], record[name][::-1])
     np.testing.assert_array_equal(turned["tracks"], record["tracks"][:, ::-1])
     np.testing.assert_array_equal(turned["visible"], record["visible"][:, ::-1])
-    assert turned["depth"] is None
+    assert drawn_direction(ALWAYS, record | {"depth": None}, np.random.default_rng(0))["depth"] is None
     again = drawn_direction(BackwardsConfig(share=1.0), turned, np.random.default_rng(0))
     np.testing.assert_array_equal(again["actions"][:, :2], record["actions"][:, :2])
 

@@ -8,6 +8,7 @@ import pytest
 
 from rsjax.config import ConfigError, SampleConfig, presets
 from rsjax.config.config_fields import with_values
+from rsjax.models.roboscape.departures.guidance import guided as guided_logits
 from rsjax.models.roboscape.sample import apply_network, encode_prompt, new_cache, rollout
 from rsjax.models.roboscape.transformer import Transformer
 from tests.models.roboscape.toy import depart
@@ -40,6 +41,14 @@ def test_guided_logits_lie_on_the_line_through_those_without_and_with_actions(gu
         for name, x in logits.items():
             expected = without[name] + guidance * (with_[name] - without[name])
             np.testing.assert_allclose(x, expected[:, here], rtol=1e-4, atol=1e-4)
+
+
+def test_each_clip_has_its_own_strength_of_guidance_where_strengths_are_given() -> None:
+    logits = np.random.default_rng(0).normal(size=(4, 2, 9, 2, 8)).astype(np.float32)
+    found = guided_logits(SampleConfig(guidance=2.0), {"rgb": jnp.array(logits)}, jnp.array([0.5, 3.0]))["rgb"]
+    for clip, strength in enumerate((0.5, 3.0)):
+        without = logits[2 + clip]
+        np.testing.assert_allclose(found[clip], without + strength * (logits[clip] - without), rtol=1e-5, atol=1e-5)
 
 
 def test_where_the_null_action_is_the_action_guidance_changes_nothing() -> None:

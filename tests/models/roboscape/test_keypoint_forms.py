@@ -9,6 +9,7 @@ import pytest
 
 from rsjax.config import Departures, LossConfig, NoDepth, RoboScapeConfig
 from rsjax.models.roboscape.architecture import Architecture
+from rsjax.models.roboscape.departures.normalised_attention import moved_by_others
 from rsjax.models.roboscape.objective import Batch, attention_map, loss_terms, select
 from rsjax.tokenizers import lfq
 from rsjax.trainable import Term
@@ -234,6 +235,14 @@ def test_attention_to_contact_weighs_the_cells_of_points_that_rest_before_they_m
     np.testing.assert_allclose(total / weight, np.mean(weights * nats[counted]), rtol=1e-5)
     loss = LossConfig(attention="contact", keypoint_weight=0.0)
     assert RoboScapeConfig(loss=loss, depth=NoDepth()).loss_weights == {"rgb": 0.0, "attention": 1.0}
+
+
+def test_a_point_of_a_longer_clip_rests_for_its_first_quarter() -> None:
+    tracks = np.full((1, 2, 16, 2), 0.5 / GRID, np.float32)
+    tracks[:, 0, 3:, 0] += 0.9 / GRID
+    tracks[:, 1, 4:, 0] += 0.9 / GRID
+    marked = moved_by_others(jnp.array(tracks), jnp.ones((1, 2, 16), bool), GRID)
+    np.testing.assert_array_equal(marked, np.broadcast_to([[[False], [True]]], marked.shape))
 
 
 def test_a_flat_normalised_attention_is_the_objective_without_attention() -> None:

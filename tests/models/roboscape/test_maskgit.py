@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from rsjax.config import SampleConfig
 from rsjax.models.roboscape.maskgit import Frame, keep_top, masked_after, sample_tokens, unmask_step
+from rsjax.tokenizers import lfq
 
 B, CELLS, BITS = 2, 12, 6
 LOGITS = {name: jax.random.normal(jax.random.key(i), (B, CELLS, 2, 8)) * 3 for i, name in enumerate(("rgb", "depth"))}
@@ -35,13 +36,18 @@ def clip_keys(seed: int) -> jax.Array:
 
 def decode(config: SampleConfig, seed: int = 0) -> list[Frame]:
     """The frames before the first and after every step, each step with other logits, as a model would give."""
-    frame = Frame({name: jnp.zeros((B, CELLS), jnp.int32) for name in LOGITS}, jnp.ones((B, CELLS), bool))
+    tokens = {name: jnp.zeros((B, CELLS), jnp.int32) for name in LOGITS}
+    means = {name: jnp.zeros((B, CELLS, BITS)) for name in LOGITS}
+    frame = Frame(tokens, jnp.ones((B, CELLS), bool), jnp.zeros((B, CELLS)), means)
     frames = [frame]
     for step in range(config.steps):
-        logits = {name: jnp.roll(x, step, axis=1) for name, x in LOGITS.items()}
-        frame = unmask_step(config, BITS, clip_keys(100 * seed + step), step, frame, logits)
+        frame = unmask_step(config, BITS, clip_keys(100 * seed + step), step, frame, logits_at(step))
         frames.append(frame)
     return frames
+
+
+def logits_at(step: int) -> dict[str, jax.Array]:
+    return {name: jnp.roll(x, step, axis=1) for name, x in LOGITS.items()}
 
 
 @pytest.mark.parametrize("unmask", ["random", "greedy"])
@@ -66,9 +72,16 @@ def check_decoding(config: SampleConfig) -> None:
     for step, (before, after) in enumerate(itertools.pairwise(frames)):
         np.testing.assert_array_equal(after.mask.sum(-1), masked_after(config.steps, CELLS)[step])
         assert not np.any(after.mask & ~before.mask)
+        decided = ~np.asarray(before.mask)
+        logits = logits_at(step)
         for name in LOGITS:
-            decided = ~np.asarray(before.mask)
             np.testing.assert_array_equal(after.tokens[name][decided], before.tokens[name][decided])
+            means = np.where(decided[..., None], before.means[name], lfq.mean_codes(logits[name], BITS))
+            np.testing.assert_allclose(after.means[name], means, atol=1e-6)
+        assert before.entropy is not None and after.entropy is not None
+        p = np.asarray(jax.nn.softmax(logits["rgb"]))
+        entropy = -np.sum(p * np.log(p), axis=(-2, -1))
+        np.testing.assert_allclose(after.entropy, np.where(decided, before.entropy, entropy), rtol=1e-4)
 
 
 def test_greedy_leaves_open_where_the_branches_together_are_least_sure() -> None:

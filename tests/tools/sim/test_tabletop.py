@@ -49,6 +49,15 @@ def test_a_start_depends_on_its_seed_alone(table: TabletopSim) -> None:
     assert table.robot_state[6] > 0 > table.robot_state[7], "the fingers' joints, as robosuite signs them"
 
 
+def test_an_object_at_rest_has_no_height(table: TabletopSim) -> None:
+    table.reset(3)
+    for task in OBJECTS:
+        table.task = task
+        assert abs(table.object_height) < 1e-9
+    table.step(np.zeros(7))
+    assert abs(table.object_height) < 1e-3
+
+
 def test_objects_keep_apart_and_modes_name_their_object() -> None:
     rng = np.random.default_rng(0)
     places = scattered(rng, 4)

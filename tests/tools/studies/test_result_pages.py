@@ -10,6 +10,7 @@ import pytest
 from rsjax.errors import UserError
 from rsjax.evaluation.statistics import wilson
 from rsjax.tools.studies.result_pages import DATA, FOLDER, add_runs, differences, part_of, write_pages
+from rsjax.tools.studies.run_results import run_tables
 from tests.tools.pipeline.conftest import command, debug, printed_by, shared
 
 __all__ = ["command", "debug", "shared"]  # fixtures
@@ -85,6 +86,15 @@ def test_a_run_becomes_a_file_and_the_table_of_its_scores(root: Path, debug: Pat
     head, _, shorter, *_ = (line.split(" | ") for line in part_of(root, "tiny", "headline").splitlines())
     assert head[:4] == lines[0].split(" | ")[:4] and shorter[:4] == prediction[:4]
     assert len(head) == len(shorter) == 5 and shorter[4].removesuffix(" |") == f"{metrics['depth_absrel']:.4f}"
+
+
+def test_runs_on_the_same_clips_do_not_narrow_the_interval_of_a_share(root: Path, debug: Path) -> None:
+    add_runs(root, [debug], "tiny")
+    content = json.loads((root / DATA / "tiny.json").read_text())
+    (run,) = content["runs"]
+    moved = run | {"clips": run["clips"] | {"psnr_repeat_first": [0.0, 1.0]}}
+    cells = [run_tables(content | {"runs": runs})["scores"].rows[0][-1] for runs in ([run], [run, run], [run, moved])]
+    assert cells[0] == cells[1] != cells[2]
 
 
 def test_the_runs_of_a_file_are_finished(root: Path, debug: Path, tmp_path: Path) -> None:

@@ -7,7 +7,6 @@ ones.
 Axes: P points, T frames, H×W pixels.
 """
 
-import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -70,20 +69,23 @@ class GridTracker(Annotator):
 
 @dataclass(frozen=True)
 class LucasKanade(GridTracker):
-    """Pyramidal Lucas–Kanade from picture to picture; a point that does not return when followed back is lost.
+    """Pyramidal Lucas–Kanade; a point that does not return when followed back is lost.
 
-    Where a patch stays the same, its point stays too, even on a surface without texture: if the camera moves over such
-    a surface, the tracker does not notice. A lost point reappears only where it was lost, when its patch reappears.
+    A point stays while its patch is the same as in the picture in which it last moved, even on a surface without
+    texture: if the camera moves over such a surface, the tracker does not notice. Then it is followed from that picture
+    to the present one, so that motion too slow to show from one picture to the next adds up. A lost point reappears
+    only where it was lost, when its patch reappears.
 
     Attributes:
         window: side of the patch that is matched, in pixels.
         levels: levels of the pyramid, in addition to the picture itself.
         tolerance: how far from its start a point may end when it is followed forward and back, in pixels.
-        likeness: least correlation of a point's patch with that of the previous picture; less means another surface.
+        likeness: least correlation of a point's patch with the one it is followed from; less means another surface.
         still: grey levels (of 255) by which a pixel of a patch may change while the patch counts as the same.
     """
 
     name: ClassVar[str] = "lucas-kanade"
+    version: ClassVar[int] = 2
     least: ClassVar[dict[str, int]] = {"window": 3, "levels": 0}
     window: int = 9
     levels: int = 3
@@ -97,16 +99,20 @@ class LucasKanade(GridTracker):
         place = points.astype(np.float32) * size - 0.5
         in_sight = np.ones(len(points), bool)
         patch = _patches(grey[0], place, self.window)
+        reference = np.zeros(len(points), int)  # the number of the picture that a point's place and patch are of
         places = [place]
         visible = [in_sight]
-        for before, after in itertools.pairwise(grey):
-            stays = np.abs(_patches(after, place, self.window) - patch).max(1, initial=0.0) <= self.still
-            going = np.flatnonzero(in_sight & ~stays)
+        for number, picture in enumerate(grey[1:], 1):
+            stays = np.abs(_patches(picture, place, self.window) - patch).max(1, initial=0.0) <= self.still
+            going = in_sight & ~stays
             place = place.copy()
             in_sight = stays
-            place[going], in_sight[going] = self._step(before, after, place[going])
-            now = _patches(after, place, self.window)
-            patch = np.where(in_sight[:, None], now, patch)
+            for earlier in np.unique(reference[going]):
+                some = np.flatnonzero(going & (reference == earlier))
+                place[some], in_sight[some] = self._step(grey[earlier], picture, place[some])
+            moved = np.flatnonzero(going & in_sight)
+            patch[moved] = _patches(picture, place[moved], self.window)
+            reference[moved] = number
             places.append(place)
             visible.append(in_sight)
         return ((np.stack(places, 1) + 0.5) / size).astype(np.float32), np.stack(visible, 1)
@@ -114,7 +120,7 @@ class LucasKanade(GridTracker):
     def _step(
         self, before: UInt8[np.ndarray, "H W"], after: UInt8[np.ndarray, "H W"], start: Points
     ) -> tuple[Points, Bool[np.ndarray, " P"]]:
-        """Moves points from one picture to the next; points that are lost (False) stay where they are."""
+        """Moves points from one picture to another; points that are lost (False) stay where they are."""
         if not len(start):
             return start, np.zeros(0, bool)
         options: Any = {"winSize": (self.window, self.window), "maxLevel": self.levels}

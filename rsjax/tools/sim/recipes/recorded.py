@@ -11,7 +11,7 @@ from rsjax.data.codec import Record
 from rsjax.data.store import MANIFEST, open_store
 from rsjax.errors import UserError
 from rsjax.files import file_versions
-from rsjax.tools.sim.episode import POLICY, EpisodePlan, Replay
+from rsjax.tools.sim.episode import POLICY, EpisodePlan, Replay, begins_episode
 
 
 def recorded(config: SimConfig, store: Path, place: int, name: str) -> EpisodePlan:
@@ -42,5 +42,9 @@ def _episodes(store: Path, versions: tuple[tuple[int, ...], ...]) -> list[Record
         manner = record["provenance"].get("expert")
         if not isinstance(manner, dict) or manner.get("mode") != POLICY:
             raise UserError(f"{store}: its clips are not of policies in the simulator; make it with rsjax record")
+        if not begins_episode(record):
+            raise UserError(
+                f"{store}: its clips begin in the middle of episodes; name the store of whole ones beside it"
+            )
         episodes.append({name: record[name] for name in ("actions", "provenance")})
     return episodes

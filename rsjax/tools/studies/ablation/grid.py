@@ -223,16 +223,16 @@ def make_grid(
     for seed, values in itertools.product(seeds, combinations):
         try:
             cells[cell_name(values, seed)] = with_values(base, {**values, SEED: seed})
-        except ConfigError as error:
+        except (ConfigError, AttributeError, TypeError) as error:  # a section that is chosen may lack a field
             wrong.append(f"{cell_name(values, seed)}: {error}")
     require(not wrong, f"{len(wrong)} of {len(wrong) + len(cells)} cells cannot run; the first is {''.join(wrong[:1])}")
     return Grid(fields, cells)
 
 
 def values_of(config: Config, fields: Sequence[str]) -> dict[str, Value]:
-    """Returns the values of these fields, by dotted name."""
+    """Returns the values of these fields, by dotted name; "–" for one that the configuration's section lacks."""
     known = config_fields(config)
-    return {field: known[field].value for field in fields}
+    return {field: known[field].value if field in known else "–" for field in fields}
 
 
 def cell_name(values: Mapping[str, Value], seed: int) -> str:
@@ -280,7 +280,9 @@ def merge(before: Grid | None, new: Grid, out: Path) -> tuple[Grid, tuple[str, .
     fields = tuple(dict.fromkeys((*before.fields, *new.fields)))
     old, now = (config_fields(next(iter(grid.cells.values()))) for grid in (before, new))
     unset = ConfigField("not set", None, False)
-    pairs = {name: (old.get(name, unset), now.get(name, unset)) for name in old | now if name not in (*fields, SEED)}
+    inside = tuple(f"{field}." for field in fields)  # of sections that vary
+    same = [name for name in old | now if name not in (*fields, SEED) and not name.startswith(inside)]
+    pairs = {name: (old.get(name, unset), now.get(name, unset)) for name in same}
     differing = [
         f"{name} is {there.value} there, {here.value} here"
         for name, (there, here) in pairs.items()
@@ -312,8 +314,7 @@ def read_grid(out: Path) -> Grid | None:
         return None
     try:
         saved = read_json(path)
-        base = from_dict(Config, saved["config"])
-        cells = {name: with_values(base, values) for name, values in saved["cells"].items()}
+        cells = {name: from_dict(Config, values) for name, values in saved["cells"].items()}
         return Grid(tuple(saved["fields"]), cells, saved["versions"])
     except (UserError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise ConfigError(f"{path}: damaged or of another version ({error}); choose another --out") from error
@@ -335,8 +336,7 @@ def add_cells(out: Path, new: Grid, choice: Choice) -> tuple[Grid, tuple[str, ..
         if before and before.versions != grid.versions:
             then, now = (", ".join(map(" ".join, each.versions.items())) for each in (before, grid))
             note(f"{out}: earlier cells may be of other versions ({then}; now {now})")
-        base = to_dict(next(iter(grid.cells.values())))
-        cells = {name: values_of(config, (*grid.fields, SEED)) for name, config in grid.cells.items()}
-        content = {"fields": grid.fields, "cells": cells, "config": base, "versions": grid.versions}
+        cells = {name: to_dict(config) for name, config in grid.cells.items()}
+        content = {"fields": grid.fields, "cells": cells, "versions": grid.versions}
         write_json(out / FILE, content)
     return grid, chosen

@@ -68,7 +68,8 @@ def caption(outcome: Outcome) -> str:
     seeds = sorted({len(arm.seeds) for arm in outcome.arms})
     if seeds == [1]:
         return f"Compared at {EQUAL[outcome.claim.equal]}; one seed."
-    return f"Compared at {EQUAL[outcome.claim.equal]}; {' to '.join(map(str, seeds))} seeds, which vary {vary}."
+    counts = " to ".join(map(str, dict.fromkeys([seeds[0], seeds[-1]])))
+    return f"Compared at {EQUAL[outcome.claim.equal]}; {counts} seeds, which vary {vary}."
 
 
 def verdict_words(verdict: Verdict, margin: float = 0.0, unit: str = "") -> str:

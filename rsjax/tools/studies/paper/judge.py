@@ -165,6 +165,8 @@ def _measure(claim: Claim, comparison: ArmComparison, arms: Mapping[str, ArmScor
         pair = _paired(better, than, comparison)
     except Unavailable as reason:
         return replace(judged, reason=str(reason))
+    if pair.own_clips:
+        judged = replace(judged, seeds=(len(pair.a), len(pair.b)))
     summarise = np.mean if metric.statistic == "mean" else np.median
     a, b = (np.array([summarise(row) for row in rows]) for rows in (pair.a, pair.b))
     success = comparison.metric == SUCCESS
@@ -182,7 +184,7 @@ def _measure(claim: Claim, comparison: ArmComparison, arms: Mapping[str, ArmScor
     if test is None or inner_test is None:
         return replace(judged, reason="one seed says nothing about others")
     judged = replace(judged, test=test, difference=_wider(resampled, test), inner=_wider(inner, inner_test))
-    if success and not statistics.can_lose(distinct(pair.b), -comparison.margin):
+    if success and not statistics.can_lose(trials(pair.b, pair.own_clips), -comparison.margin):
         return replace(judged, reason="the other side succeeds too seldom for a loss of the margin to show")
     return judged
 
@@ -204,15 +206,19 @@ def _verdict(judged: Judged) -> Verdict:
 def _resampled(pair: PairedScores, level: float, statistic: Statistic, success: bool) -> Estimate:
     """Returns the difference with its interval over seeds and clips, or, for success rates, Newcombe's."""
     if success:
-        return statistics.share_difference(distinct(pair.a), distinct(pair.b), level)
+        sides = (trials(pair.a, pair.own_clips), trials(pair.b, pair.own_clips))
+        return statistics.share_difference(*sides, level)
     if pair.own_clips:
         return statistics.nested_bootstrap(pair.a, pair.b, level=level, statistic=statistic)
     return statistics.paired_bootstrap(np.stack(pair.a), np.stack(pair.b), level=level, statistic=statistic)
 
 
-def distinct(rows: Rows) -> np.ndarray:
-    """Returns the trials of all seeds, those that seeds share once: an arm that no seed trains has the same in all."""
-    return np.concatenate(list({np.asarray(row).tobytes(): row for row in rows}.values()))
+def trials(rows: Rows, own_clips: bool) -> Float[np.ndarray, " _"]:
+    """Returns the trials of all seeds; those of one seed if all have the same, as an arm does that no seed trains."""
+    first = rows[0]
+    if not own_clips and all(np.array_equal(first, row) for row in rows[1:]):
+        return first
+    return np.concatenate(rows)
 
 
 def _paired(better: ArmScores, than: ArmScores, comparison: ArmComparison) -> PairedScores:
@@ -230,9 +236,10 @@ def _paired(better: ArmScores, than: ArmScores, comparison: ArmComparison) -> Pa
         raise Unavailable("both arms are the same configuration in this preset")
     own_clips = len(set(better.clips)) > 1 or len(set(than.clips)) > 1
     if own_clips:
-        common = [clips for clips in better.clips if clips in than.clips]
-        a = [a[better.clips.index(clips)] for clips in common]
-        b = [b[than.clips.index(clips)] for clips in common]
+        other = dict(zip(than.seeds, than.clips, strict=True))
+        common = [seed for seed, clips in zip(better.seeds, better.clips, strict=True) if other.get(seed) == clips]
+        a = [a[better.seeds.index(seed)] for seed in common]
+        b = [b[than.seeds.index(seed)] for seed in common]
         sizes = [(len(one), len(other)) for one, other in zip(a, b, strict=True)]
         different = next((pair for pair in sizes if pair[0] != pair[1]), None)
     else:

@@ -119,6 +119,12 @@ def merge_claim_result(path: Path, study: Path) -> None:
                 f"{study}: its {what} differ from those of {path}; add it without --merge or by another --name"
             )
     arms = [merge_arms(one, other) for one, other in zip(ours.arms, theirs.arms, strict=True)]
+    for arm in arms:
+        if 1 < len(set(arm.clips)) < len(arm.clips):
+            raise FileError(
+                f"{study}: its seeds share their clips and those of {path} do not, or the other way round (--vary); "
+                f"add it without --merge or by another --name"
+            )
     about = {name: after[name] for name in ("command", "preset", "budget", "sizes")}
     about |= {name: list(dict.fromkeys([*before[name], *after[name]])) for name in ("commits", "machines")}
     days = sorted(day for content in (before, after) for day in content["dates"].split(" to "))

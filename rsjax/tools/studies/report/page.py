@@ -114,6 +114,7 @@ def write_report(path: Path, report: RunReport) -> None:
             "filmstrip": webp_uri(filmstrip(clip)),
             "keypoints": None if clip.tracks is None else webp_uri(keypoints(clip)),
             "depth_range": clip.depth_range() if clip.has_depth() else None,
+            "metres": clip.depth_unit == "metres",
         }
         for clip in report.clips
     ]

@@ -1,5 +1,6 @@
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -20,6 +21,21 @@ def test_points_on_a_sliding_picture_slide_with_it(step):
     assert inside.any() and seen[inside].all()
     assert np.abs((places - truth)[inside] * [64, 48]).max() < 0.2
     assert np.abs((places - truth)[seen] * [64, 48]).max() < 1
+
+
+@pytest.mark.parametrize(("speed", "noise"), [(0.1, 0.0), (0.0, 2.0)])
+def test_slow_motion_adds_up_and_noise_does_not(speed: float, noise: float) -> None:
+    rng = np.random.default_rng(0)
+    grey = cv2.GaussianBlur(texture(96, 96).astype(np.float32), (0, 0), 1)
+    moved = [cv2.warpAffine(grey, np.array([[1, 0, speed * t], [0, 1, 0]]), (96, 96)) for t in range(33)]
+    frames = np.stack(moved)[..., None].repeat(3, -1) + rng.normal(0, noise, (33, 96, 96, 1))
+    points = grid_points(8, np.zeros((0, 2), np.float32))
+    points = points[((points > 0.2) & (points < 0.7)).all(1)]
+    places, seen = LucasKanade().follow(frames.clip(0, 255).astype(np.uint8), points)
+    assert seen.mean() > 0.75
+    travelled = 96 * (places[:, -1] - points)[seen[:, -1]]
+    np.testing.assert_allclose(travelled[:, 0], 32 * speed, atol=0.5)
+    np.testing.assert_allclose(travelled[:, 1], 0, atol=0.2)
 
 
 def test_a_point_that_leaves_the_picture_is_not_seen_there():

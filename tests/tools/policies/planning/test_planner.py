@@ -331,4 +331,11 @@ def test_sums_of_actions_go_on_from_those_before_the_prompt(tmp_path: Path) -> N
     at_rest = model.plan(*inputs, past=np.zeros((5, 28), np.float32))
     np.testing.assert_allclose(at_rest.rgb, plain.rgb, atol=1)
     past = rng.normal(0, 0.4, (2, 28)).astype(np.float32)
-    assert (model.plan(*inputs, past=past).rgb != plain.rgb).any()
+    moved = model.plan(*inputs, past=past)
+    assert (moved.rgb != plain.rgb).any()
+    # It adds the same to all frames after the first, as their positions could.
+    added = past.sum(0) / np.maximum(trained.assets.normalization.action_std, 1e-3) / 4
+    positions = trained.params["pos_embed"].copy()
+    positions[1:] += added.astype(np.float32) @ trained.params["action_encoder"]["kernel"][28:]
+    placed = model.plan(trained.params | {"pos_embed": positions}, *inputs[1:])
+    np.testing.assert_allclose(placed.rgb.astype(int), moved.rgb, atol=1)

@@ -14,7 +14,7 @@ from rsjax.data.store import MANIFEST, write_store
 from rsjax.errors import UserError
 from rsjax.tools.policies.on_policy import rollouts
 from rsjax.tools.policies.worlds.simulator_world import SimulatorWorld
-from rsjax.tools.sim.episode import POLICY, run_episode
+from rsjax.tools.sim.episode import POLICY, WINDOW, run_episode
 from rsjax.tools.sim.recipes.plans import training_plans
 from rsjax.tools.sim.recipes.recorded import recorded
 from tests.tools.policies.toy import demo_store
@@ -63,6 +63,15 @@ def test_another_recording_at_the_same_path_is_read(tmp_path: Path) -> None:
         os.utime(tmp_path / "store" / MANIFEST, (seed, seed))  # the clock may be too coarse, and the inode the same
         seeds.append(recorded(CONFIG, tmp_path / "store", 0, "episode").seed)
     assert seeds == [1, 2]
+
+
+def test_windows_of_a_recording_are_no_recordings(tmp_path: Path) -> None:
+    provenance = {"expert": {"mode": POLICY}, "episode": 0, "seed": 0, WINDOW: 3}
+    record = {"actions": np.zeros((CONFIG.frames, CONFIG.action_dim), np.float32), "provenance": provenance}
+    write_store(tmp_path / "store", "clips", {"train": [record]}, {})
+    with pytest.raises(UserError) as refused:
+        recorded(CONFIG, tmp_path / "store", 0, "episode")
+    assert "begin in the middle of episodes" in str(refused.value)
 
 
 def test_clips_that_no_policy_made_are_no_recordings(tmp_path: Path) -> None:

@@ -216,6 +216,19 @@ def test_a_grid_is_read_as_it_was_written(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "grid.json").read_text())["versions"]["jax"]
 
 
+def test_a_grid_over_sections_is_read_as_it_was_written_and_grows(tmp_path: Path) -> None:
+    base = with_values(DEBUG, {"model.depth": "head", "model.depth.feed_back": False})
+    grid = toy.grid("model.depth=none,head", base=base)
+    add(tmp_path, grid)
+    assert read_grid(tmp_path) == grid
+    names = add(tmp_path, toy.grid("model.depth=head,small_branch", base=base))
+    assert names == ("model.depth=head,seed=0", "model.depth=small_branch,seed=0")
+    small = with_values(DEBUG, {"model.depth": "small_branch"})
+    with pytest.raises(ConfigError) as refused:
+        toy.grid("model.depth=small_branch,head", "model.depth.width=32,64", base=small)
+    assert "cells cannot run" in str(refused.value)
+
+
 def test_more_values_fields_and_seeds_add_cells_and_keep_those_there_are(tmp_path: Path) -> None:
     first = toy.grid("model.depth=branch,none")
     add(tmp_path, first)

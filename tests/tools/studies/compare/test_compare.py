@@ -94,6 +94,17 @@ def test_unlike_evaluations_are_refused_by_field(make: Make, changes: dict, says
         read_groups([make("a", plain), make("b", replace(plain, **merged))], None)
 
 
+def test_reconstructions_by_different_tokenizers_are_not_compared(make: Make) -> None:
+    plain = toy.result(0.0)
+    one = replace(plain, protocol=plain.protocol | {"reference": "reconstruction"})
+    still = [score + 0.1 for score in plain.per_clip["psnr_repeat_first"]]
+    other = replace(one, per_clip=plain.per_clip | {"psnr_repeat_first": still})
+    assert len(read_groups([make("a", one), make("b", one)], None)) == 2
+    with pytest.raises(UserError) as refused:
+        read_groups([make("c", one), make("d", other)], None)
+    assert "the tokenizers differ" in str(refused.value)
+
+
 def test_seeds_that_do_not_vary_leave_a_json_file_that_can_be_read(make: Make) -> None:
     groups = [make(name, *(toy.result(gain, noise=0.0) for _ in range(2))) for name, gain in (("a", 0.0), ("b", 1.0))]
     found = compare(read_groups(groups, "paper"), ["psnr"])

@@ -16,7 +16,7 @@ from rsjax.tools.studies.paper import result_files
 from rsjax.tools.studies.paper.arm_scores import ArmScores, ScoreRows, key_of_test_clips, rounded
 from rsjax.tools.studies.paper.claim import ArmComparison
 from rsjax.tools.studies.paper.claim_tables import claim_content, claim_tables
-from rsjax.tools.studies.paper.judge import Outcome, distinct, judge_claim
+from rsjax.tools.studies.paper.judge import Outcome, judge_claim, trials
 from rsjax.tools.studies.paper.run import run_plan
 from rsjax.tools.studies.tables import as_markdown
 from tests.tools.studies.paper import toy
@@ -47,7 +47,7 @@ def arm(
             rows.append(tuple(rounded(float(value), 4) or 0.0 for value in row))
         found[metric] = ScoreRows(tuple(rows))
     numbers = {metric: [float(np.mean(row)) for row in scored.rows] for metric, scored in found.items()}
-    seeds = tuple(range(len(keys)))
+    seeds = tuple(map(OWN.index, clips)) or tuple(range(len(keys)))
     return ArmScores(name, SEEDS, seeds, tuple(f"{name} {seed}" for seed in seeds), keys, numbers, {"": found})
 
 
@@ -82,9 +82,11 @@ def test_a_planted_difference_is_found(gain: float, noise: float, verdict: str, 
     assert found.difference.low == low, "the interval that is shown decides"
 
 
-def test_trials_that_seeds_share_count_once() -> None:
-    rows = [np.array([1.0, 0.0]), np.array([0.0, 0.0]), np.array([1.0, 0.0])]
-    np.testing.assert_array_equal(distinct(rows), [1, 0, 0, 0])
+def test_trials_that_all_seeds_share_count_once() -> None:
+    row = np.array([1.0, 0.0])
+    assert len(trials([row, row, row], own_clips=False)) == 2
+    assert len(trials([row, row, row], own_clips=True)) == 6
+    assert len(trials([row, row, 1 - row], own_clips=False)) == 6
 
 
 def test_seeds_of_one_arm_alone_have_no_pair() -> None:
@@ -204,6 +206,19 @@ def test_seeds_of_two_machines_are_judged_as_those_of_one(tmp_path: Path, clips:
     (tmp_path / "printed.json").write_text('{"kind": "transcribed", "tables": {}}')
     with pytest.raises(result_files.FileError):
         result_files.merge_claim_result(tmp_path / "printed.json", theirs)
+
+
+def test_seeds_that_share_their_clips_do_not_join_others(tmp_path: Path) -> None:
+    files = []
+    for name, clips, rows in (("ours", (), slice(3)), ("theirs", OWN, slice(3, None))):
+        arms = [some_seeds(arm(each, clips=clips), rows) for each in ("with", "without")]
+        files.append(tmp_path / f"{name}.json")
+        found = judge_claim(toy.claim("toy", ArmComparison("psnr", "with", "without")), arms)
+        about = {"command": "c", "preset": "tiny", "budget": "1 h", "sizes": {}, "commits": [], "machines": []}
+        result_files.write_claim_result(files[-1], found, about | {"dates": "2026-01-01"})
+    with pytest.raises(result_files.FileError) as refused:
+        result_files.merge_claim_result(*files)
+    assert "(--vary)" in str(refused.value)
 
 
 def test_a_damaged_file_is_one_line(tmp_path: Path) -> None:
