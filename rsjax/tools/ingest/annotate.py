@@ -7,8 +7,8 @@
   bool (P, n).
 * ``semantics``: ``task``, ``scene``, ``segments`` (a list of [start, end, text, skill]) and ``key_frames``.
 
-Pictures are read a few at a time, so that their memory does not grow with the length of an episode. Tracks grow with it:
-9 bytes for each point of a shot and each of its frames.
+Pictures are read a few at a time, so that their memory does not grow with the length of an episode. That of tracks
+does: 9 bytes for each point of a shot and each of its frames.
 
 Axes: N recorded frames, n some of them, T frames of a clip, H×W pixels, P points, S shots.
 """
