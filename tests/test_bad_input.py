@@ -238,7 +238,7 @@ OPTIONS = {
     "bench roboscape_s --only sample --batch 10000": "--batch 10000: so much at once takes more than",
     "bench debug --only sample --horizons 99999999": "--horizons is 99999999; it can be at most 10,000",
     "paper --preset debug --dry-run --seeds 99999999": "--seeds is 99999999; it must be 1 … 1000",
-    "plan PLACE/run --energy tokens --candidates 99999999": "--candidates 99999999 and --horizon 6: so much at once",
+    "plan PLACE/run --energy tokens --candidates 99999999": "--candidates 99999999 and --horizon 12: so much at once",
     "plan PLACE/run --energy tokens --max-steps 99999999": "--max-steps is 99999999; it can be at most 10,000",
     "plan PLACE/run --energy tokens --rounds 99999999": "--rounds is 99999999; it can be at most 1,000",
     "synthesize PLACE/run --demos 99999999": "--demos is 99999999; it can be at most 1,000,000",
