@@ -1,7 +1,7 @@
 """Settings of the training loop and its optimizer."""
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import ClassVar, Literal
 
 from rsjax.config.fields import require, require_range, runtime
@@ -212,7 +212,7 @@ class LoopConfig(RuntimeConfig, TrainConfig):
     """
 
     restarts: tuple[int, ...] = ()
-    last_stage: int = 0
+    last_stage: int = field(default=0, repr=False, metadata={"runtime": True})  # follows from the curriculum
     skip_budget: int = runtime(10)
     keep_last: int = runtime(2)
     keep_every: int = runtime(0)
@@ -228,7 +228,7 @@ class LoopConfig(RuntimeConfig, TrainConfig):
     @classmethod
     def create(cls, train: TrainConfig, runtime: RuntimeConfig = RuntimeConfig()) -> "LoopConfig":
         """Joins the settings of a stage's training with those of the run."""
-        return cls(**{field.name: getattr(train, field.name) for field in fields(TrainConfig)}, **vars(runtime))
+        return cls(**{each.name: getattr(train, each.name) for each in fields(TrainConfig)}, **vars(runtime))
 
     def __post_init__(self) -> None:
         RuntimeConfig.__post_init__(self)

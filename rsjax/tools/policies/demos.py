@@ -94,10 +94,9 @@ def load_demos(store: Store, splits: Sequence[str], only: Only = "success", seed
             if is_demo(clip, only, labelled):
                 records.append({"rgb": clip["rgb"], "actions": clip["actions"]})
     if not records:
-        if labelled:
-            which = "ends in success"
-        else:
-            which = "can be read"
+        which = "can be read"
+        if only == "success":
+            which = "begins as its episode does" + " and ends in success" * labelled
         raise UserError(
             f"{store.path}: none of its clips ({', '.join(splits)}) {which}; there is nothing to learn from"
         )
@@ -122,7 +121,10 @@ def chooses(store: Store, only: Only) -> bool:
     """Returns whether to take only clips that end in success; prints a note if the store does not say which do."""
     known = store.manifest.get("success_share") is not None
     if only == "success" and not known:
-        note(f"{store.path}: does not say which of its clips end in success, so all of them are taken")
+        note(
+            f"{store.path}: does not say which of its clips end in success, so all that begin as their episodes do are "
+            f"taken"
+        )
     return only == "success" and known
 
 

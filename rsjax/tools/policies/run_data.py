@@ -141,13 +141,22 @@ class RunData:
         return load_judge(folder or self.run / FOLDER, self.config.clips.image_size)
 
     def first_frames(self, count: int, split: str = "train") -> list[FirstFrame]:
-        """Returns the first frames of ``count`` clips that begin as their episodes do, with depth if they have it."""
+        """Returns the first frames of ``count`` clips that begin as their episodes do, with depth if they have it.
+
+        Raises:
+            UserError: no clip does.
+        """
         clips = readable(self.clips.source(split))
         chosen = islice((pair for pair in clips if begins_episode(pair[1])), count)
-        return [
+        starts = [
             FirstFrame(clip["rgb"][0], None if clip["depth"] is None else clip["depth"][0], number, number)
             for number, clip in chosen
         ]
+        if not starts:
+            raise UserError(
+                f"{self.clips.path}, split {split}: no clip begins as its episode does, so nothing can start"
+            )
+        return starts
 
     def demos(self, only: Only = "success", seed: int = 0) -> Demos:
         """Returns the run's training clips as demonstrations."""

@@ -2,6 +2,7 @@
 
 import struct
 import time
+from contextlib import suppress
 from socket import SO_SNDTIMEO, SOL_SOCKET
 from socket import socket as Socket
 from typing import Any
@@ -48,7 +49,8 @@ class BoundedListener(Socket):
                 continue
             self._accepted = [each for each in self._accepted if each.fileno() >= 0]
             if len(self._accepted) < self._most:
-                connection.setsockopt(SOL_SOCKET, SO_SNDTIMEO, self._send_limit)
+                with suppress(OSError):  # the client may have left already
+                    connection.setsockopt(SOL_SOCKET, SO_SNDTIMEO, self._send_limit)
                 self._accepted.append(connection)
                 return connection, address
             connection.close()

@@ -74,7 +74,8 @@ class LucasKanade(GridTracker):
     A point stays while its patch is the same as in the picture in which it last moved, even on a surface without
     texture: if the camera moves over such a surface, the tracker does not notice. Then it is followed from that picture
     to the present one, so that motion too slow to show from one picture to the next adds up; if that fails, from the
-    previous picture. A lost point reappears only where it was lost, when its patch reappears.
+    previous picture. In the last picture of a span every point is followed, since the next span knows no earlier one. A
+    lost point reappears only where it was lost, when its patch reappears.
 
     Attributes:
         window: side of the patch that is matched, in pixels.
@@ -105,13 +106,16 @@ class LucasKanade(GridTracker):
         for number, picture in enumerate(grey[1:], 1):
             stays = np.abs(_patches(picture, place, self.window) - patch).max(1, initial=0.0) <= self.still
             going = in_sight & ~stays
+            if number == len(grey) - 1:  # the next span knows no earlier picture
+                going = in_sight
             place = place.copy()
-            in_sight = stays
+            in_sight = stays & ~going
             for earlier in np.unique(reference[going]):
                 some = np.flatnonzero(going & (reference == earlier))
                 place[some], in_sight[some] = self._step(grey[earlier], picture, place[some])
             again = np.flatnonzero(going & ~in_sight & (reference < number - 1))
             place[again], in_sight[again] = self._step(grey[number - 1], picture, place[again])
+            in_sight = in_sight | stays
             moved = np.flatnonzero(going & in_sight)
             patch[moved] = _patches(picture, place[moved], self.window)
             reference[moved] = number

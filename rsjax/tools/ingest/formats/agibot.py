@@ -137,6 +137,7 @@ class AgiBot:
                 hands = hands.astype(np.float32)
             hands = align_actions(hands, after=proprio.copied())
             actions = np.concatenate([hands, align_actions(proprio.grippers())], 1)
+            actions[:1] = 0  # the grippers' first commands are unknown
         folder = inside(self._root, f"observations/{place}")
         segments = []
         bad_segments = []

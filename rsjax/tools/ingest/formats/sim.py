@@ -6,6 +6,7 @@ and ``meta["clip"]`` says where. Any other store of clips is read in the same wa
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -67,6 +68,12 @@ class StoreSource:
     kind: Kind | None = None
     held: tuple[int, ...] | None = None
 
+    @cached_property
+    def origins(self) -> dict[str, list[str]]:
+        """The episode of each clip, by split; the whole store is read for them, once."""
+        sources = {split: self.store.source(split) for split in self.splits}
+        return {split: [episode_of(source, each) for each in range(len(source))] for split, source in sources.items()}
+
     def episodes(self) -> Iterator[EpisodeRef]:
         """Lists every clip of every split, in the store's order. Clips of one episode are of one recording."""
         declared = (self.kind, self.held)
@@ -77,10 +84,9 @@ class StoreSource:
             *([declared] if declared != (None, None) else []),
         )
         for split in self.splits:
-            source = self.store.source(split)
-            for number in range(len(source)):
+            for number, episode in enumerate(self.origins[split]):
                 location = {"split": split, "record": number}
-                if episode := episode_of(source, number):
+                if episode:
                     location["recording"] = f"{split}-{episode}"
                 yield EpisodeRef(f"{split}-{number:06d}", fingerprint((), key, split, number), location)
 

@@ -260,6 +260,9 @@ def repeated_cells(grid: Grid) -> list[str]:
     return lines
 
 
+UNSET = ConfigField("not set", None)
+
+
 def merge(before: Grid | None, new: Grid, out: Path) -> tuple[Grid, tuple[str, ...]]:
     """Adds cells to a directory's grid.
 
@@ -278,16 +281,21 @@ def merge(before: Grid | None, new: Grid, out: Path) -> tuple[Grid, tuple[str, .
     if before is None:
         return new, tuple(new.cells)
     fields = tuple(dict.fromkeys((*before.fields, *new.fields)))
-    old, now = (config_fields(next(iter(grid.cells.values()))) for grid in (before, new))
-    unset = ConfigField("not set", None, False)
-    inside = tuple(f"{field}." for field in fields)  # of sections that vary
-    same = [name for name in old | now if name not in (*fields, SEED) and not name.startswith(inside)]
-    pairs = {name: (old.get(name, unset), now.get(name, unset)) for name in same}
-    differing = [
-        f"{name} is {there.value} there, {here.value} here"
-        for name, (there, here) in pairs.items()
-        if there.value != here.value and not here.runtime
-    ]
+    earlier = {tuple(values_of(config, fields).values()): config for config in before.cells.values()}
+    usual = next(iter(before.cells.values()))
+    differing: dict[str, None] = {}
+    for config in new.cells.values():
+        like = earlier.get(tuple(values_of(config, fields).values()))
+        ours = config_fields(config)
+        theirs = config_fields(like or usual)
+        # Other choices of a section have other fields.
+        skipped = () if like else tuple(f"{field}." for field in fields)
+        for name in theirs | ours:
+            there = theirs.get(name, UNSET)
+            here = ours.get(name, UNSET)
+            compared = name not in (*fields, SEED) and not name.startswith(skipped) and not here.runtime
+            if compared and there.value != here.value:
+                differing[f"{name} is {there.value} there, {here.value} here"] = None
     require(
         not differing,
         f"{out} holds a grid of another configuration ({'; '.join(differing)}); choose another --out, or vary these "

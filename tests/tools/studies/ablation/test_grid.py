@@ -223,6 +223,9 @@ def test_a_grid_over_sections_is_read_as_it_was_written_and_grows(tmp_path: Path
     assert read_grid(tmp_path) == grid
     names = add(tmp_path, toy.grid("model.depth=head,small_branch", base=base))
     assert names == ("model.depth=head,seed=0", "model.depth=small_branch,seed=0")
+    with pytest.raises(ConfigError) as refused:
+        add(tmp_path, toy.grid("model.depth=none,head", seeds=(0, 1)))
+    assert "(model.depth.feed_back is False there, True here)" in str(refused.value)
     small = with_values(DEBUG, {"model.depth": "small_branch"})
     with pytest.raises(ConfigError) as refused:
         toy.grid("model.depth=small_branch,head", "model.depth.width=32,64", base=small)

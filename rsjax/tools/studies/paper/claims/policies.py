@@ -32,11 +32,11 @@ from rsjax.tools.studies.paper.claims.baselines import RATES
 from rsjax.tools.studies.paper.measurements import FOLDER, Scores, measurement
 
 STRONG = 0.9  # correlation with success in the simulator that counts as strong
-# Seconds on 2 cores; a decision considers 96 sequences.
+# Seconds on 2 cores; a decision considers 96 sequences of 12 frames.
 POLICY_STEP = 0.31
 JUDGE_STEP = 0.12
 EPISODE = 1.7
-DECISION = 6.5
+DECISION = 13.0
 
 
 @dataclass(frozen=True)
@@ -199,7 +199,7 @@ def improved(run: Run) -> Scores:
     return {name: [float(success) for success in row] for name, row in rows.items()}
 
 
-@measurement("planned", _seconds(trials=2, decisions=2 * 20))
+@measurement("planned", _seconds(trials=2, decisions=2 * closed_loop.PlanSettings().max_steps))
 def planned(run: Run) -> Scores:
     """Plans in the run's world model and acts in the simulator."""
     size = Size.of(run.config)
