@@ -1,12 +1,17 @@
 """What all simulators share, on Lift: they tell of divergence, and do not disturb one another."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from rsjax.tools.sim.lift import LiftSim
 
 
-def test_a_simulation_that_diverges_is_told_though_it_begins_anew(sim: LiftSim) -> None:
+def test_a_simulation_that_diverges_is_told_though_it_begins_anew(
+    sim: LiftSim, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)  # where MuJoCo writes its log
     sim.reset(0)
     sim.step(np.zeros(7))
     sim._data.qvel[0] = np.nan
