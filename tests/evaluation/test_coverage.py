@@ -11,11 +11,13 @@ import pytest
 from rsjax.clip import Video
 from rsjax.config import SampleConfig
 from rsjax.config.config_fields import with_values
+from rsjax.data.store import Store
 from rsjax.evaluation.coverage import NEAREST, Coverage, clip_distances, features_of, make_coverage, read_coverage
 from rsjax.evaluation.metrics.coverage import coverage as score
 from rsjax.evaluation.registry import Familiarity, Scene, Unavailable
 from rsjax.models.roboscape.teacher_forcing import score_tokens
 from rsjax.models.roboscape.transformer import run_with_trunk
+from rsjax.models.trained import TrainedModel
 from rsjax.tools.play.play_run import PlayRun
 from rsjax.tools.policies.run_data import RunData
 from rsjax.tools.policies.studies.policy_evaluation import covered
@@ -25,12 +27,25 @@ from tests.models.roboscape.test_state_heads import WHOLE
 from tests.models.roboscape.toy_sample import BATCH, given, random_params
 from tests.tools.pipeline import toy
 
-CLIPS, FRAMES, WIDTH, ACTIONS = 6, 4, 5, 3
+CLIPS = 6
+FRAMES = 4
+WIDTH = 5
+ACTIONS = 3
 
 
-def parts(seed: int, clips: int = CLIPS) -> tuple[np.ndarray, np.ndarray]:
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
+    return toy.store(tmp_path_factory.mktemp("toy") / "clips")
+
+
+@pytest.fixture(scope="module")
+def trained(store: Store) -> TrainedModel:
+    return toy.trained(store)
+
+
+def parts(seed: int, clips: int = CLIPS, frames: int = FRAMES) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
-    return rng.normal(3, 2, (clips, FRAMES, WIDTH)), rng.normal(-1, 0.5, (clips, FRAMES, ACTIONS))
+    return rng.normal(3, 2, (clips, frames, WIDTH)), rng.normal(-1, 0.5, (clips, frames, ACTIONS))
 
 
 def by_hand(row: np.ndarray, bank: list[np.ndarray]) -> float:
@@ -68,8 +83,7 @@ def test_distances_are_those_of_a_loop_over_all_frames_of_other_clips() -> None:
 
 @pytest.mark.parametrize(("clips", "frames"), [(2, 3), (3, 2), (4, 1)])
 def test_of_few_frames_as_many_count_as_other_clips_have(clips: int, frames: int) -> None:
-    rng = np.random.default_rng(0)
-    features, actions = rng.normal(size=(clips, frames, WIDTH)), rng.normal(size=(clips, frames, ACTIONS))
+    features, actions = parts(0, clips, frames)
     bank = Coverage.of(features, actions)
     assert np.isfinite(bank.frame_distances).all()
     _, percentile = bank.of_frames(bank.distances(features + 100, actions + 100))
@@ -95,9 +109,7 @@ def test_features_are_those_of_a_full_pass_before_the_frame_is_seen() -> None:
     np.testing.assert_allclose(found, np.asarray(trunk)[:, 1:].mean(2), rtol=1e-3, atol=1e-4)  # type: ignore[arg-type]
 
 
-def test_a_run_makes_its_bank_once(tmp_path: Path) -> None:
-    store = toy.store(tmp_path / "clips")
-    trained = toy.trained(store)
+def test_a_run_makes_its_bank_once(store: Store, trained: TrainedModel, tmp_path: Path) -> None:
     assert read_coverage(trained, store, tmp_path) is None
     made = make_coverage(trained, store, tmp_path)
     assert made is not None
@@ -148,9 +160,7 @@ def test_the_metric_reports_distance_percentile_and_the_correlation_with_errors(
         score(Scene(Video(truth), Video(truth)))
 
 
-def test_episodes_of_a_world_are_measured_up_to_their_ends(tmp_path: Path) -> None:
-    store = toy.store(tmp_path / "clips")
-    trained = toy.trained(store)
+def test_episodes_of_a_world_are_measured_up_to_their_ends(store: Store, trained: TrainedModel, tmp_path: Path) -> None:
     bank = make_coverage(trained, store, tmp_path)
     assert bank is not None
     clip = store.source("test")[0]

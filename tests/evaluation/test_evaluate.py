@@ -16,11 +16,18 @@ from rsjax.evaluation.generation import ClipBatch, Generation, rolled_out, with_
 from rsjax.evaluation.metrics.delta_psnr import action_range, other_clips, uniform_actions
 from rsjax.evaluation.metrics.psnr import psnr as pixels
 from rsjax.evaluation.protocols import PAPER, find, of_run
-from rsjax.evaluation.registry import metrics
+from rsjax.evaluation.registry import Unavailable, metrics
 from rsjax.evaluation.results import Evaluation, load_evaluation, save_evaluation
 from rsjax.evaluation.shown import choose_clips
 from rsjax.models.trained import TrainedModel
 from tests.tools.pipeline import toy
+
+NO_SIMULATOR = Unavailable("there is no simulator")
+# Its draws are random, and two clips are one batch.
+SAMPLED = replace(
+    toy.with_model(toy.config(), sample=SampleConfig(steps=2, temperature=1.0)),
+    eval=EvalConfig(clips=2, batch_size=2, action_draws=1, weights=""),
+)
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +42,13 @@ def trained(clips: Store) -> TrainedModel:
 
 @pytest.fixture(scope="module")
 def result(trained: TrainedModel, clips: Store) -> Evaluation:
-    return evaluate(trained, clips)
+    return evaluate(trained, clips, probes=NO_SIMULATOR)
+
+
+@pytest.fixture(scope="module")
+def own(trained: TrainedModel) -> Video:
+    """All clips, generated in one batch."""
+    return generated(trained, TRUTH["actions"])
 
 
 def eval_clips() -> list[dict[str, np.ndarray]]:
@@ -61,7 +74,6 @@ def abs_rel(truth: np.ndarray, depth: np.ndarray) -> float:
 
 
 def generated(trained: TrainedModel, actions: np.ndarray) -> Video:
-    """All clips in one batch."""
     return trained.generate(TRUTH["rgb"][:, :1], actions, TRUTH["depth"][:, :1])
 
 
@@ -91,9 +103,10 @@ def test_the_last_frame_of_a_longer_prompt_is_repeated(clips: Store, trained: Tr
         np.testing.assert_array_equal(still.depth[:, frame], TRUTH["depth"][:, 2])
 
 
-def test_batches_with_a_filled_up_last_one_score_as_one_batch_does(trained: TrainedModel, result: Evaluation) -> None:
+def test_batches_with_a_filled_up_last_one_score_as_one_batch_does(
+    trained: TrainedModel, own: Video, result: Evaluation
+) -> None:
     """5 clips in batches of 2 against one batch of 5; ΔPSNR with the same key under other clips' actions."""
-    own = generated(trained, TRUTH["actions"])
     assert own.depth is not None
     assert result.metrics["psnr"] == pytest.approx(psnr(TRUTH["rgb"], own.rgb), rel=1e-4)
     assert result.metrics["depth_absrel"] == pytest.approx(abs_rel(TRUTH["depth"], own.depth), rel=1e-4)
@@ -110,13 +123,9 @@ def test_batches_with_a_filled_up_last_one_score_as_one_batch_does(trained: Trai
 
 def test_own_actions_in_place_of_random_ones_make_no_difference(clips: Store, monkeypatch: pytest.MonkeyPatch) -> None:
     """The sampling key is the same: with the same actions every ΔPSNR is 0, at random draws too."""
-    config = replace(
-        toy.with_model(toy.config(), sample=SampleConfig(temperature=1.0)),
-        eval=EvalConfig(clips=4, batch_size=4, action_draws=1, weights=""),
-    )
     monkeypatch.setattr(evaluation.delta_psnr, "other_clips", lambda clips, draws, seed: np.arange(clips)[None])
     monkeypatch.setattr(evaluation.delta_psnr, "uniform_actions", lambda own, *_, seed: own[None])
-    metrics = evaluate(toy.trained(clips, config), clips).metrics
+    metrics = evaluate(toy.trained(clips, SAMPLED), clips).metrics
     deltas = {name: value for name, value in metrics.items() if name.startswith("delta_psnr")}
     assert len(deltas) == 24
     assert set(deltas.values()) == {0.0}
@@ -130,14 +139,12 @@ def test_every_registered_metric_has_a_score_or_a_reason(result: Evaluation) -> 
         *PROBED,
         *(name for name in metrics() if name.startswith(("state_", "coverage"))),
     }
+    assert {name for name, reason in result.reasons.items() if reason == str(NO_SIMULATOR)} == PROBED
     assert result.metrics["depth_absrel_median_branch_repeat_first"] > 0
 
 
-def test_shown_clips_are_typical_ones_and_the_worst_by_their_own_psnr(
-    trained: TrainedModel, result: Evaluation
-) -> None:
-    own = generated(trained, TRUTH["actions"]).rgb
-    scores = [psnr(TRUTH["rgb"][[i]], own[[i]]) for i in range(toy.TEST)]
+def test_shown_clips_are_typical_ones_and_the_worst_by_their_own_psnr(own: Video, result: Evaluation) -> None:
+    scores = [psnr(TRUTH["rgb"][[i]], own.rgb[[i]]) for i in range(toy.TEST)]
     rows, ranks = choose_clips(np.array(scores), np.array(toy.SUCCESS), 6)
     assert result.shown["clip"].tolist() == rows.tolist()
     assert rows[1] == np.argmin(scores)
@@ -227,50 +234,45 @@ def test_batches_for_other_devices_are_made_anew(
 
 
 def test_repetitions_are_averaged_and_draw_differently(clips: Store, tmp_path: Path) -> None:
-    config = toy.with_model(toy.config(), sample=SampleConfig(temperature=1.0))
-    trained = toy.trained(clips, config)
-    protocol = replace(of_run(config), repetitions=2, action_draws=0, samples=2)
+    trained = toy.trained(clips, SAMPLED)
+    protocol = replace(of_run(SAMPLED), repetitions=2, action_draws=0, samples=2)
     found = evaluate(trained, clips, protocol, folder=tmp_path)
     first, second = (each["psnr"] for each in found.repetitions)
     assert first != second
     assert found.metrics["psnr"] == found.metrics["psnr_n1_pred_only"] == pytest.approx((first + second) / 2)
     assert "generates no videos under other actions" in found.reasons["delta_psnr"]
-    eval_clips = EvaluationClips.read(clips, "test", protocol, config.clips)
+    assert found.reasons.keys() >= PROBED
+    eval_clips = EvaluationClips.read(clips, "test", protocol, SAMPLED.clips)
     generation = evaluation.plan(trained, clips, eval_clips, tmp_path)  # reads what was generated
-    best = []
-    for run in range(2):
-        own = np.asarray(pixels(TRUTH["rgb"], generation.videos(run)["own"][0].rgb)).mean(1)  # the prompt included
-        best.append(np.maximum(own, generation.samples(run)[0]["psnr"]))
-        assert (best[-1] != own).any()
-    np.testing.assert_allclose(found.per_clip["psnr_best2_incl_ctx"], np.mean(best, axis=0), rtol=1e-5)
-
-
-def test_a_teacher_forced_frame_follows_true_frames(clips: Store, trained: TrainedModel) -> None:
-    protocol = replace(of_run(trained.config), clips=2, teacher_forced=True, horizon=2, action_draws=0)
-    eval_clips = EvaluationClips.read(clips, "test", protocol, trained.config.clips)
-    made = evaluation.plan(trained, clips, eval_clips).videos(0)["own"][0]
-    rows, prompt = eval_clips.clips.index, trained.config.prompt_frames
-    whole = TRUTH["rgb"][rows], TRUTH["actions"][rows], TRUTH["depth"][rows]
-    later = trained.generate(whole[0][:, : prompt + 1], whole[1][:, : prompt + 2], whole[2][:, : prompt + 1])
-    np.testing.assert_array_equal(made.rgb[:, -1], later.rgb[:, -1])
-    assert made.rgb.shape[1] == prompt + 2
+    videos = np.stack([generation.videos(run)["own"][0].rgb for run in range(2)])
+    truth = np.broadcast_to(eval_clips.clips.rgb, videos.shape)
+    own = np.asarray(pixels(truth, videos)).mean(-1)  # the prompt included
+    best = np.maximum(own, [generation.samples(run)[0]["psnr"] for run in range(2)])
+    assert (best != own).any()
+    np.testing.assert_allclose(found.per_clip["psnr_best2_incl_ctx"], best.mean(0), rtol=1e-5)
 
 
 @pytest.mark.parametrize("teacher_forced", [False, True])
-def test_actions_into_recorded_frames_stay_the_clips_own(teacher_forced: bool) -> None:
+def test_teacher_forced_frames_follow_true_ones_and_actions_into_these_stay_the_clips_own(teacher_forced: bool) -> None:
     """Random actions that contradict the frames of a prompt would count as loss of PSNR under other actions."""
-    own, others, seen = np.zeros((1, 5, 1)), np.ones((1, 5, 1)), []
+    own = np.zeros((1, 5, 1))
+    others = np.ones((1, 5, 1))
+    truth = np.ones((1, 5, 2, 2, 3), np.uint8) * np.arange(5, dtype=np.uint8)[:, None, None, None]
+    seen = []
 
     def generate(prompt: Video, actions: np.ndarray) -> Video:
-        seen.append((prompt.rgb.shape[1], actions[0, :, 0].tolist()))
-        return Video(np.zeros((1, actions.shape[1], 2, 2, 3), np.uint8))
+        """Generates frames that are brighter by 10 than the last one of the prompt."""
+        seen.append((prompt.rgb[0, :, 0, 0, 0].tolist(), actions[0, :, 0].tolist()))
+        return Video(np.repeat(prompt.rgb[:, -1:] + np.uint8(10), actions.shape[1], axis=1))
 
-    protocol, truth = (
-        replace(PAPER, prompt_frames=3, teacher_forced=teacher_forced),
-        np.zeros((1, 5, 2, 2, 3), np.uint8),
-    )
-    assert rolled_out(generate, protocol, Video(truth), own, others).rgb.shape == truth.shape
-    assert seen == ([(3, [0, 0, 0, 1]), (4, [0, 0, 0, 0, 1])] if teacher_forced else [(3, [0, 0, 0, 1, 1])])
+    protocol = replace(PAPER, prompt_frames=3, teacher_forced=teacher_forced)
+    made = rolled_out(generate, protocol, Video(truth), own, others).rgb
+    if teacher_forced:
+        assert seen == [([0, 1, 2], [0, 0, 0, 1]), ([0, 1, 2, 3], [0, 0, 0, 0, 1])]
+        assert made[0, :, 0, 0, 0].tolist() == [12, 12, 12, 12, 13]
+    else:
+        assert seen == [([0, 1, 2], [0, 0, 0, 1, 1])]
+        assert made[0, :, 0, 0, 0].tolist() == [12] * 5
 
 
 def test_clips_that_are_too_short_or_small_are_refused(clips: Store, trained: TrainedModel) -> None:

@@ -1,7 +1,6 @@
 """The choice of clips for the report."""
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -12,18 +11,11 @@ SUCCESS = np.array([False, True, True, False, True, False, False, True])
 
 
 def test_half_are_nearest_to_the_median_and_half_the_worst() -> None:
-    rows, ranks = choose_clips(PSNR, SUCCESS, 4)
-    assert rows[1::2].tolist() == [1, 5]
-    assert ranks.tolist() == [0, 1, 0, 2]
-    # Successes are 1.25 (clip 7) and 2.25 (clip 2) from the median, failures 0.25 (clips 3 and 6) and 0.75 (clip 0).
-    assert rows[::2].tolist() == [7, 3]
-
-
-@pytest.mark.parametrize(("count", "typical"), [(1, [7]), (3, [7, 3]), (5, [7, 3, 2]), (7, [7, 3, 2, 6])])
-def test_of_an_odd_number_one_more_is_typical(count: int, typical: list[int]) -> None:
-    rows, ranks = choose_clips(PSNR, SUCCESS, count)
-    assert len(rows) == len(ranks) == count
-    assert rows[ranks == 0].tolist() == typical
+    rows, ranks = choose_clips(PSNR, SUCCESS, 7)
+    assert rows[1::2].tolist() == [1, 5, 0]
+    assert ranks.tolist() == [0, 1, 0, 2, 0, 3, 0]
+    # Successes are 1.25 (clip 7) and 2.25 (clip 2) from the median, failures 0.25 (clips 3 and 6).
+    assert rows[::2].tolist() == [7, 3, 2, 6]
 
 
 def test_the_ends_by_hand() -> None:

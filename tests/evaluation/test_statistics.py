@@ -33,24 +33,11 @@ def test_bootstrap_agrees_with_a_loop_and_with_normal_theory():
     rng = np.random.default_rng(99)
     means = [rng.choice(values, len(values)).mean() for _ in range(10_000)]
     assert got.value == pytest.approx(values.mean())
+    assert bootstrap(values, seed=3) == bootstrap(values, seed=3) != bootstrap(values, seed=4)
     np.testing.assert_allclose([got.low, got.high], np.quantile(means, [0.025, 0.975]), atol=0.05)
     np.testing.assert_allclose(got.high - got.low, 2 * 1.96 * values.std() / np.sqrt(40), rtol=0.05)
-
-
-def test_bootstrap_is_seeded_and_covers_what_it_says():
-    rng = np.random.default_rng(1)
-    values = rng.normal(size=30)
-    assert bootstrap(values, seed=3) == bootstrap(values, seed=3) != bootstrap(values, seed=4)
-    hits = 0
-    for i in range(200):
-        interval = bootstrap(rng.normal(size=30), seed=i, resamples=500)
-        hits += interval.low <= 0 <= interval.high
-    assert 0.88 < hits / 200 < 0.99
-
-
-def test_one_clip_has_a_mean_but_no_interval():
-    assert bootstrap(np.array([7.0])).flat("psnr") == {"psnr": 7.0}
-    assert set(bootstrap(np.array([7.0, 8.0])).flat("psnr")) == {"psnr", "psnr_low", "psnr_high"}
+    assert got.flat("psnr") == {"psnr": got.value, "psnr_low": got.low, "psnr_high": got.high}
+    assert bootstrap(np.array([7.0])).flat("psnr") == {"psnr": 7.0}, "one clip has no interval"
 
 
 @pytest.mark.parametrize("values", [[], [1.0, np.nan], [[1.0, 2.0]]])
@@ -172,21 +159,13 @@ def test_a_paired_t_test_agrees_with_scipy():
     assert paired_t(a[:1], b[:1]) is None
 
 
-def test_two_one_sided_tests_agree_with_scipy_and_err_as_often_as_they_say():
+def test_two_one_sided_tests_agree_with_scipy():
     rng = np.random.default_rng(4)
     a, b = rng.normal(0.05, 0.1, 5), rng.normal(0, 0.1, 6)
     above = stats.ttest_ind(a, b - 0.2, equal_var=False, alternative="greater").pvalue  # of a - b > -0.2
     below = stats.ttest_ind(a, b + 0.2, equal_var=False, alternative="less").pvalue
     assert welch(a, b).p_beyond(0.2) == pytest.approx(max(above, below))
     assert welch(a, b).p_of(0.1) == pytest.approx(stats.ttest_ind(a, b + 0.1, equal_var=False).pvalue)
-
-    def found_equal(difference, trials=400):
-        tests = [welch(rng.normal(difference, 0.05, 5), rng.normal(0, 0.05, 5)) for _ in range(trials)]
-        return float(np.mean([test.p_beyond(0.2) < 0.05 for test in tests]))
-
-    assert found_equal(0.0) > 0.95
-    assert found_equal(0.2) < 0.09, "at the margin, one in twenty"
-    assert found_equal(0.3) == 0
     same = welch([1.0, 1.0], [1.0, 1.0])
     assert (same.p_beyond(0.1), same.p_beyond(0.0), same.p_of(0.0), same.p_of(0.1)) == (0, 1, 1, 0)
 

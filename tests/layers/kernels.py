@@ -1,6 +1,6 @@
 """Where kernels run in tests: on a GPU if there is one, and otherwise in Pallas' interpreter, slowly."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -12,13 +12,16 @@ from rsjax.layers.platform import for_all_platforms
 INTERPRETED = jax.default_backend() != "gpu"
 
 
-def dtypes(exact: float) -> list[tuple[jnp.dtype, float]]:
-    """Returns each dtype in which kernels are tested, with its bound; ``exact`` is that of float32.
+def in_dtypes(cases: Sequence[tuple[Any, ...]], exact: float, interpreted: bool = INTERPRETED) -> list[tuple[Any, ...]]:
+    """Returns the cases in which kernels are tested, each with a dtype and its bound; ``exact`` is that of float32.
 
-    Programs for GPUs have kernels for bf16 alone, so on a GPU float32 is not tested.
+    Programs for GPUs have kernels for bf16 alone, so on a GPU all cases are in bf16. The slow interpreter runs them in
+    float32, and the first in bf16 too.
     """
-    of_bf16 = [(jnp.bfloat16, 1e-2)]
-    return [(jnp.float32, exact), *of_bf16] if INTERPRETED else of_bf16
+    bf16 = (jnp.bfloat16, 1e-2)
+    if not interpreted:
+        return [(*case, *bf16) for case in cases]
+    return [*((*case, jnp.float32, exact) for case in cases), (*cases[0], *bf16)]
 
 
 def lowered(run: Callable[..., Any], operands: tuple[Any, ...], target: str) -> str:

@@ -12,9 +12,3 @@ def test_values_and_gradients_are_those_of_the_exact_gelu() -> None:
     value, own_backward = jax.vjp(gelu, X)
     np.testing.assert_allclose(value, expected, atol=2e-6)
     np.testing.assert_allclose(own_backward(X)[0], backward(X)[0], atol=2e-5)
-
-
-def test_the_gradient_is_the_slope() -> None:
-    step = 1e-2
-    slope = (gelu(X[:1001] + step) - gelu(X[:1001] - step)) / (2 * step)
-    np.testing.assert_allclose(jax.vmap(jax.grad(gelu))(X[:1001]), slope, atol=1e-3)

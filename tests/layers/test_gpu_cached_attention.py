@@ -12,7 +12,7 @@ from rsjax.layers.attention import KeyValues, attend_cached
 from rsjax.layers.gpu.cached_attention import attend, fits
 from rsjax.layers.kernel_flops import kernel_flops
 from rsjax.layers.platform import attend_over_cache
-from tests.layers.kernels import INTERPRETED, dtypes, lowered
+from tests.layers.kernels import INTERPRETED, in_dtypes, lowered
 
 SHAPE = (2, 2, 8, 3, 2, 32)
 SLOTS = 16
@@ -25,18 +25,17 @@ def operands(shape: tuple[int, ...], slots: int, dtype: Any) -> tuple[jax.Array,
     return qkv.astype(dtype), cache[0].astype(dtype), cache[1].astype(dtype)
 
 
-@pytest.mark.parametrize(("dtype", "bound"), dtypes(2e-6))
-@pytest.mark.parametrize(
-    ("shape", "slots", "start", "window"),
-    [
-        (SHAPE, SLOTS, 14, 16),  # the last frames of a window
-        (SHAPE, SLOTS, 0, 16),  # nothing in the cache
-        (SHAPE, SLOTS, 21, 6),  # slots used again, older than the window
-        ((1, 2, 3, 3, 6, 16), 8, 5, 1),  # each frame sees itself alone; numbers that are no powers of two
-        ((1, 1, 64, 3, 1, 64), 8, 3, 8),  # several programs along cells
-        ((1, 1, 2, 3, 4, 128), 32, 30, 32),  # and along heads
-    ],
-)
+CASES = [
+    (SHAPE, SLOTS, 14, 16),  # the last frames of a window
+    (SHAPE, SLOTS, 0, 16),  # nothing in the cache
+    (SHAPE, SLOTS, 21, 6),  # slots used again, older than the window
+    ((1, 2, 3, 3, 6, 16), 8, 5, 1),  # each frame sees itself alone; numbers that are no powers of two
+    ((1, 1, 64, 3, 1, 64), 8, 3, 8),  # several programs along cells
+    ((1, 1, 2, 3, 4, 128), 32, 30, 32),  # and along heads
+]
+
+
+@pytest.mark.parametrize(("shape", "slots", "start", "window", "dtype", "bound"), in_dtypes(CASES, 2e-6))
 def test_values_are_those_of_plain_attention(
     shape: tuple[int, ...], slots: int, start: int, window: int, dtype: Any, bound: float
 ) -> None:

@@ -10,9 +10,9 @@ import pytest
 from jaxtyping import Array
 
 from rsjax.layers.gpu.feed_forward import feed_forward, fits
-from tests.layers.kernels import INTERPRETED, dtypes
+from tests.layers.kernels import INTERPRETED, in_dtypes
 
-SHAPES = [
+CASES = [
     ((1, 1, 128, 32), 128),
     ((2, 1, 128, 96), 256),  # several tiles of both axes, several steps
 ]
@@ -23,8 +23,7 @@ def reference(x: Array, fc1: Any, fc2: Any) -> Array:
     return h @ fc2[0] + fc2[1]
 
 
-@pytest.mark.parametrize(("shape", "hidden"), SHAPES)
-@pytest.mark.parametrize(("dtype", "bound"), dtypes(3e-6))
+@pytest.mark.parametrize(("shape", "hidden", "dtype", "bound"), in_dtypes(CASES, 3e-6))
 def test_values_and_gradients_are_those_of_plain_layers(
     shape: tuple[int, ...], hidden: int, dtype: Any, bound: float
 ) -> None:

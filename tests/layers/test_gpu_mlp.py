@@ -10,11 +10,12 @@ import pytest
 from jaxtyping import Array
 
 from rsjax.layers.gpu.mlp import fits, mlp
-from tests.layers.kernels import INTERPRETED, dtypes
+from tests.layers.kernels import INTERPRETED, in_dtypes
 
-SHAPES = [
-    ((1, 2, 64, 64), 128),
-    ((2, 1, 128, 256), 192),  # several tiles of each clip, several chunks
+CASES = [
+    (True, (1, 2, 64, 64), 128),
+    (True, (2, 1, 128, 256), 192),  # several tiles of each clip, several chunks
+    (False, (2, 1, 128, 256), 192),
 ]
 
 
@@ -37,9 +38,7 @@ def reference(x: Array, norm: Any, fc1: Any, fc2: Any) -> Array:
     return x + h @ fc2[0] + fc2[1]
 
 
-@pytest.mark.parametrize("has_norm", [True, False])
-@pytest.mark.parametrize(("shape", "hidden"), SHAPES)
-@pytest.mark.parametrize(("dtype", "bound"), dtypes(3e-6))
+@pytest.mark.parametrize(("has_norm", "shape", "hidden", "dtype", "bound"), in_dtypes(CASES, 3e-6))
 def test_values_and_gradients_are_those_of_plain_layers(
     has_norm: bool, shape: tuple[int, ...], hidden: int, dtype: Any, bound: float
 ) -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from rsjax.layers import platform
 from rsjax.layers.gpu.norm_linear import fits, norm_linear
-from tests.layers.kernels import INTERPRETED, dtypes
+from tests.layers.kernels import INTERPRETED, in_dtypes
 
 
 def reference(x: Any, norm: Any, kernel: Any) -> Any:
@@ -19,8 +19,9 @@ def reference(x: Any, norm: Any, kernel: Any) -> Any:
     return nn.LayerNorm(1e-5).apply({"params": {"scale": scale, "bias": bias}}, x) @ kernel
 
 
-@pytest.mark.parametrize(("shape", "outputs"), [((2, 1, 64, 256), 192), ((1, 2, 64, 64), 64)])
-@pytest.mark.parametrize(("dtype", "bound"), dtypes(3e-6))
+@pytest.mark.parametrize(
+    ("shape", "outputs", "dtype", "bound"), in_dtypes([((2, 1, 64, 256), 192), ((1, 2, 64, 64), 64)], 3e-6)
+)
 def test_values_are_those_of_plain_layers(shape: tuple[int, ...], outputs: int, dtype: Any, bound: float) -> None:
     assert fits(shape, outputs)
     x, norm, kernel = operands(shape, outputs, dtype)

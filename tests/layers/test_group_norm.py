@@ -11,8 +11,14 @@ import pytest
 from rsjax.layers.group_norm import GroupNorm
 
 
-@pytest.mark.parametrize("shape", [(3, 5, 8), (2, 4, 6, 8), (2, 3, 4, 6, 8)])
-@pytest.mark.parametrize(("groups", "local", "affine"), [(4, False, True), (1, False, False), (2, True, True)])
+@pytest.mark.parametrize(
+    ("shape", "groups", "local", "affine"),
+    [
+        ((3, 5, 8), 1, False, False),
+        ((2, 4, 6, 8), 4, False, True),
+        ((2, 3, 4, 6, 8), 2, True, True),
+    ],
+)
 def test_results_and_gradients_are_flaxs(shape: tuple[int, ...], groups: int, local: bool, affine: bool) -> None:
     keys = jax.random.split(jax.random.key(0), 4)
     x, weights = 30 + 2 * jax.random.normal(keys[0], shape), jax.random.normal(keys[1], shape)

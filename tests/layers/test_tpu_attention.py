@@ -6,8 +6,9 @@ import pytest
 from rsjax.layers.packed_attention import Over
 from rsjax.layers.tpu.attention import attend, fits
 from tests.layers.attention_reference import assert_like_plain
+from tests.layers.kernels import in_dtypes
 
-SHAPES = [
+CASES = [
     ("cells", (1, 2, 128, 3, 4, 32)),  # four heads share a register
     ("cells", (1, 1, 256, 3, 4, 64)),  # two registers
     ("frames", (2, 16, 16, 3, 4, 32)),
@@ -15,8 +16,7 @@ SHAPES = [
 ]
 
 
-@pytest.mark.parametrize(("over", "shape"), SHAPES)
-@pytest.mark.parametrize(("dtype", "bound"), [(jnp.float32, 2e-6), (jnp.bfloat16, 1e-2)])
+@pytest.mark.parametrize(("over", "shape", "dtype", "bound"), in_dtypes(CASES, 2e-6, interpreted=True))
 def test_values_and_gradients_are_those_of_plain_attention(
     over: Over, shape: tuple[int, ...], dtype: jnp.dtype, bound: float
 ) -> None:

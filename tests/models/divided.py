@@ -1,9 +1,5 @@
-"""Generates and scores clips on several devices; :mod:`tests.models.test_divided` runs this.
+"""Generates and scores clips on four devices; :mod:`tests.training.four_devices` runs this."""
 
-Prints, by program, whether each of its results lies in rows on the devices.
-"""
-
-import json
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -43,27 +39,28 @@ def watch(module: ModuleType, name: str) -> None:
 def ivideogpt() -> None:
     model = IVideoGPT(MODEL, CLIPS)
     assets = Assets(Normalization((0.0,) * 3, (1.0,) * 3, None), replicate(vq_params()))
-    params, actions = replicate(llama_params(model.architecture)), np.zeros((2, 3, 3), np.float32)
-    model.generate(params, assets, Video(frames(2, 1)), actions)
+    params = replicate(llama_params(model.architecture))
+    model.generate(params, assets, Video(frames(4, 1)), np.zeros((4, 3, 3), np.float32))
 
 
 def teacher_forcing() -> None:
-    """Scores three clips, in batches of one that are rounded up to two."""
+    """Scores five clips, in batches of one that are rounded up to four."""
     with tempfile.TemporaryDirectory() as folder:
         store = toy.store(Path(folder) / "clips")
         trained, source = toy.trained(store), store.source("test")
-        clips = Clips.stacked([source[i] for i in range(3)], range(3))
+        clips = Clips.stacked([source[i] for i in range(5)], range(5))
     config = replace(trained.config, eval=replace(trained.config.eval, batch_size=1))
     some = clips.first(3)
     model = replace(trained, config=config, params=replicate(trained.params))
     taught = teacher_forced(model, config.prompt_frames, some.video, some.actions)
     assert taught is not None
-    assert taught.accuracy["rgb"].shape == (3, 2)
+    assert taught.accuracy["rgb"].shape == (5, 2)
 
 
-if __name__ == "__main__":
+def in_rows() -> dict[str, list[bool]]:
+    """By program, whether each of its results lies in rows on the devices."""
     for module, name in ((rollout, "sample"), (autoencoder, "_apply"), (teacher, "_score_window")):
         watch(module, name)
     ivideogpt()
     teacher_forcing()
-    print(json.dumps(IN_ROWS))
+    return IN_ROWS

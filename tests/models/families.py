@@ -1,6 +1,5 @@
 """Each family with its networks so small that a whole run of them takes no time, on the toy clips."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -17,7 +16,7 @@ from tests.models.ivideogpt import toy as toy_ivideogpt
 from tests.tools.pipeline import toy
 
 TRAIN: dict[str, Any] = {"steps": 4, "batch_size": 2, "ema": 0.9}
-RUNTIME = RuntimeConfig(log_every=1, checkpoint_every=2, eval_every=4)
+RUNTIME = RuntimeConfig(log_every=1, checkpoint_every=4, eval_every=4)
 
 
 def engine(config: Config) -> Config:
@@ -43,10 +42,9 @@ def ivideogpt() -> Config:
 
 
 def irasim() -> Config:
-    """IRASim on RGB and depth with an autoencoder of its own, whose batches are accumulated."""
-    base = with_values(engine(toy_irasim.config(integrate_actions=True)), {"model.autoencoder.depth": "inverse"})
-    accumulated = {"train.accumulate": 2, "tokenizer_train.accumulate": 2}
-    return with_values(base, {**accumulated, "tokenizer_train.depth_share": 0.5})
+    """IRASim on RGB and depth with an autoencoder of its own."""
+    base = engine(toy_irasim.config(integrate_actions=True))
+    return with_values(base, {"model.autoencoder.depth": "inverse", "tokenizer_train.depth_share": 0.5})
 
 
 def cogvideox() -> Config:
@@ -60,13 +58,17 @@ def cogvideox() -> Config:
 FAMILIES = {"genie": genie, "ivideogpt": ivideogpt, "irasim": irasim, "cogvideox": cogvideox}
 
 
-def batches_of(config: Config, clips: int = 4) -> Iterator[tuple[Any, Any, Any]]:
-    """Both networks, with shapes of their parameters and a batch of clips."""
+def autoencoder_batch(config: Config, clips: int) -> tuple[Any, Any, Any]:
+    """The family's own autoencoder, with shapes of its parameters and a batch of clips."""
+    autoencoder = create_autoencoder(config)
+    rng = np.random.default_rng(0)
+    transform = autoencoder.transform()
+    rows = [transform({"rgb": toy.clip(i).rgb, "depth": None}, rng) for i in range(clips)]
+    arrays = {name: np.stack([row[name] for row in rows]) for name in rows[0]} | {"index": np.arange(clips)}
+    return autoencoder, autoencoder.shapes(), autoencoder.batch(arrays)
+
+
+def model_batch(config: Config, clips: int) -> tuple[Any, Any, Any]:
+    """The world model, with shapes of its parameters and a batch of clips."""
     model = create_model(config)
-    if config.model.own_autoencoder is not None:
-        autoencoder, rng = create_autoencoder(config), np.random.default_rng(0)
-        transform = autoencoder.transform()
-        rows = [transform({"rgb": toy.clip(i).rgb, "depth": None}, rng) for i in range(clips)]
-        arrays = {name: np.stack([row[name] for row in rows]) for name in rows[0]} | {"index": np.arange(clips)}
-        yield autoencoder, autoencoder.shapes(), autoencoder.batch(arrays)
-    yield model, jax.eval_shape(model.init, jax.random.key(0)), inputs.batch(model, config, clips)
+    return model, jax.eval_shape(model.init, jax.random.key(0)), inputs.batch(model, config, clips)

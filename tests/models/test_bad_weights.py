@@ -41,16 +41,13 @@ def saved(directory: Path, settings: Any) -> Path:
         # of another family
         (world_model, GENIE, to_dict(IRASIM), "config.json: holds a model of family 'irasim'; .* family roboscape or"),
         (world_model, IVIDEOGPT, to_dict(GENIE), "config.json: holds a model of family 'genie'; .* family ivideogpt"),
-        (world_model, IRASIM, to_dict(IVIDEOGPT), "config.json: holds a model of family 'ivideogpt'; .* family irasim"),
         (world_model, IRASIM, {"model": to_dict(IVIDEOGPT.model), "inputs": {}}, "holds a model of family 'ivideogpt'"),
-        (world_model, COGVIDEOX, to_dict(IRASIM), "holds a model of family 'irasim'; .* family cogvideox"),
         (tokenizer, COGVIDEOX, to_dict(IRASIM), "holds a model of family 'irasim'; .* family cogvideox"),
         (tokenizer, IRASIM, to_dict(COGVIDEOX), "holds a model of family 'cogvideox'; .* family irasim"),
         (world_model, GENIE, {"irasim": {}}, "holds no world_model/weights with their settings"),
         (tokenizer, GENIE, to_dict(IVIDEOGPT), "its tokenizer is that of the family 'ivideogpt'; .* MAGVIT-2's"),
         (tokenizer, GENIE, {"kl_autoencoder": {}}, "holds no tokenizer/weights with their settings"),
         (tokenizer, IVIDEOGPT, to_dict(GENIE), "config.json: holds a model of family 'genie'; .* family ivideogpt"),
-        (tokenizer, IRASIM, to_dict(GENIE), "config.json: holds a model of family 'genie'; .* family irasim"),
         # something else in place of SDXL's autoencoder
         (
             tokenizer,

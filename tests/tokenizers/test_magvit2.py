@@ -101,10 +101,9 @@ def test_tokens_and_images_have_the_presets_shapes(config: TokenizerConfig, size
     assert (decoded.shape, decoded.dtype) == (image.shape, jnp.float32)
 
 
-@pytest.mark.parametrize("factor", [1, 2, 4])
-def test_space_to_depth_and_back(factor: int) -> None:
+def test_space_to_depth_and_back() -> None:
     x = np.random.default_rng(0).normal(size=(2, 8, 4, 3))
-    np.testing.assert_array_equal(depth_to_space(space_to_depth(jnp.array(x), factor), factor), jnp.array(x))
+    np.testing.assert_array_equal(depth_to_space(space_to_depth(jnp.array(x), 4), 4), jnp.array(x))
 
 
 def test_depth_to_space_puts_row_then_column_before_channel() -> None:

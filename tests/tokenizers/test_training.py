@@ -120,14 +120,6 @@ def test_images_too_small_for_the_discriminator_are_refused() -> None:
     TokenizerTraining(CONFIG, TokenizerTrainConfig(), 8)
 
 
-def test_without_weights_the_judging_networks_are_off() -> None:
-    """Then training has neither their parameters nor their terms."""
-    training = TokenizerTraining(CONFIG, TokenizerTrainConfig(), 8)
-    assert training.loss_weights.keys() == {"l1", "l2", "entropy", "commitment"}
-    assert training.init_extra() is None
-    assert jax.eval_shape(training.init, jax.random.key(0)).keys() == {"encoder", "decoder"}
-
-
 def test_training_starts_from_a_saved_tokenizer_with_or_without_a_discriminator(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     training = TokenizerTraining(CONFIG, TokenizerTrainConfig(), 8)

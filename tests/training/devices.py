@@ -1,25 +1,8 @@
-"""Takes a few steps of one state under every sharding, on four virtual devices.
+"""A world model, a tokenizer and a smaller network that train under every sharding, on virtual devices."""
 
-Prints, as JSON, how far the world model's parameters end from those of one device (the largest difference, and the
-distance as a share of the way that training moved them), for "pmap", "mesh" (data alone), "fsdp" (2 × 2), and "muon": a
-smaller network by Muon under fsdp. "gradient pmap" …: how far the gradient of the first step is from one device's, as a
-share; some clips have no depth. "gradient heads": the same under fsdp of a model with depth, motion and state heads and
-adaptive norms; the state heads lack labels for some clips. "mean of ratios" and "depth mean of ratios": how far the
-loss and its depth term are, as a share, if every device divides by its own weight. For the tokenizer: how far gradients
-and averages are from one device's ("tokenizer pmap", "tokenizer fsdp"), and how far its entropy is if each device knows
-its own images alone ("tokenizer apart"). "checkpoint": how far two steps of one sharding, saved, and a third one of
-another are from three steps; "start": whether fresh parameters are the same to the bit if they are made in parts;
-"cut": the share of the fsdp state that one device holds.
-"""
-
-import json
-import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import partial
-from operator import itemgetter
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -45,10 +28,9 @@ from rsjax.models.roboscape.model import RoboScape
 from rsjax.models.roboscape.objective import Batch
 from rsjax.tokenizers.training import TokenizerTraining
 from rsjax.trainable import StepContext, Term, Trainable
-from rsjax.training.checkpoint import Checkpoints
 from rsjax.training.sharding import Sharding
 from rsjax.training.state import TrainState, create_state
-from rsjax.training.step import combine, train_step
+from rsjax.training.step import as_numbers, train_step
 
 LOOP = LoopConfig(batch_size=8, steps=3, ema=0.9, optimizer=AdamW(learning_rate=1e-2, warmup_steps=1))
 # Wide enough that the world model's matrices are cut rather than left whole.
@@ -79,6 +61,7 @@ SHARDINGS: dict[str, dict[str, Any]] = {
     "fsdp": {"sharding": "mesh", "fsdp": 2},
 }
 STEPS = 3
+WEIGHTS = np.array([1, 1, 1, 0, 0, 0, 1, 1], np.float32)
 
 # Images that grow brighter from first to last.
 IMAGES = np.random.default_rng(0).integers(0, 100, (8, 24, 24, 3)) + 20 * np.arange(8)[:, None, None, None]
@@ -117,7 +100,7 @@ def batch(seed: int) -> Batch:
         "actions": rng.normal(size=(8, 4, 3)).astype(np.float32),
         "tracks": rng.random((8, 7, 4, 2)).astype(np.float32),
         "visible": rng.random((8, 7, 4)) < seen,
-        "weight": np.array([1, 1, 1, 0, 0, 0, 1, 1], np.float32),
+        "weight": WEIGHTS,
         "index": np.arange(8, dtype=np.int32),
         "has_depth": np.array([1, 0, 0, 1, 1, 0, 1, 1], np.float32),
         "state": np.where(rng.random((8, 1, 3)) < 0.3, np.nan, rng.integers(0, 2, (8, 4, 3))).astype(np.float32),
@@ -126,7 +109,9 @@ def batch(seed: int) -> Batch:
 
 
 class Training:
-    """One sharding's state, steps and checkpoints, as the training loop uses them."""
+    """One sharding's state, steps and checkpoints, as the training loop uses them; also the last step's metrics."""
+
+    metrics: dict[str, float]
 
     def __init__(self, kind: str, model: Trainable[Any], loop: LoopConfig, batches: Sequence[Any], start: Any) -> None:
         self.model, self.loop, self.batches = model, replace(loop, **SHARDINGS[kind]), batches
@@ -141,42 +126,22 @@ class Training:
 
     def run(self, first: int, last: int) -> TrainState:
         for step in range(first, last):
-            self.state, _ = self.step(self.state, self.sharding.put_batch(self.batches[step]))
+            self.state, metrics = self.step(self.state, self.sharding.put_batch(self.batches[step]))
+        self.metrics = as_numbers(metrics)
         return self.sharding.gather(self.state)
 
 
-def mean_of_ratios(params: Any) -> tuple[float, float]:
-    """What must not be done: every device's own ratio, averaged over devices. The errors of loss and depth term."""
-    context = StepContext(jnp.int32(0), None, None)
-
-    @jax.jit
-    def terms(params: Any, part: Any) -> dict[str, Term]:
-        return MODEL.loss_terms(params, part, jax.random.key(0), context)
-
-    def values(parts: list[dict[str, Term]]) -> np.ndarray:
-        sums = jax.tree.map(lambda *x: jnp.sum(jnp.stack(x)), *parts)
-        loss, means = combine(sums, MODEL.loss_weights)
-        return np.array([loss, means["depth"]])
-
-    cut = jax.tree.map(lambda x: x.reshape(4, 2, *x.shape[1:]), batch(0))
-    parts = [terms(params, jax.tree.map(itemgetter(i), cut)) for i in range(4)]
-    right, wrong = values(parts), np.mean([values([one]) for one in parts], axis=0)
-    of_loss, of_depth = np.abs(wrong - right) / right
-    return float(of_loss), float(of_depth)
+def compile_all(trainings: Iterable[Training]) -> None:
+    with ThreadPoolExecutor(2) as pool:
+        list(pool.map(Training.compiled, trainings))
 
 
-def tokenizer_apart(state: TrainState) -> float:
-    """What must not be done: the entropy of each device's own images. The share by which their mean is off."""
-
-    @jax.jit
-    def entropy(images: Any) -> Any:
-        context = StepContext(jnp.int32(0), state.extra, None)
-        value, weight = TOKENIZER.loss_terms(state.params, images, jax.random.key(0), context)["entropy"]
-        return value / weight
-
-    # The parts are repeated, so that one program serves the whole and the parts.
-    whole, parts = entropy(IMAGES), [entropy(np.tile(IMAGES[i : i + 2], (4, 1, 1, 1))) for i in range(0, 8, 2)]
-    return float(abs(np.mean(parts) - whole) / abs(whole))
+def drawn(model: Any, loop: LoopConfig, shapes: Any) -> Any:
+    """A state with random parameters of these shapes, made without a program."""
+    rng = np.random.default_rng(1)
+    params = jax.tree.map(lambda x: (0.1 * rng.normal(size=x.shape)).astype(np.float32), shapes)
+    state = jax.eval_shape(lambda: create_state(model, loop))
+    return jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), state).replace(params=params)
 
 
 def share(one: Any, other: Any) -> float:
@@ -197,78 +162,13 @@ def moments_apart(one: TrainState, other: TrainState) -> dict[str, float]:
     return shares | {"averages": share(one.extra, other.extra)}
 
 
+def metrics_apart(one: dict[str, float], other: dict[str, float]) -> float:
+    """The largest difference of a scalar of a step, as a share of the scalar."""
+    return max(abs(one[name] - other[name]) / (abs(one[name]) + 1e-3) for name in one)
+
+
 def distance(one: TrainState, other: TrainState, start: TrainState) -> dict[str, float]:
     flat = [np.concatenate([np.ravel(x) for x in jax.tree.leaves((s.params, s.ema))]) for s in (one, other, start)]
     apart = np.abs(flat[0] - flat[1])
     way = np.linalg.norm(flat[0] - flat[2])
     return {"largest": float(apart.max()), "share": float(np.linalg.norm(apart) / way)}
-
-
-def same(one: Any, other: Any) -> bool:
-    return all(map(np.array_equal, *map(jax.tree.leaves, (one, other))))
-
-
-def first_device_share(state: TrainState) -> float:
-    """The share of a state's elements that its first device holds."""
-    leaves = jax.tree.leaves(state)
-    return sum(x.addressable_data(0).size for x in leaves) / sum(x.size for x in leaves)
-
-
-def through_checkpoints(trainings: list[Training], start: Any) -> list[TrainState]:
-    """From each sharding's two steps to the next one's third, by way of the disk."""
-    ends = []
-    for source, sink in zip(trainings, [*trainings[1:], trainings[0]], strict=True):
-        source.state = source.sharding.adopt(start)
-        source.run(0, 2)
-        with tempfile.TemporaryDirectory() as directory:
-            checkpoints = Checkpoints(Path(directory))
-            checkpoints.save(2, source.sharding.portable(source.state), {})
-            checkpoints.close()
-            checkpoints = Checkpoints(Path(directory))
-            restored, _ = checkpoints.restore(sink.sharding.template(sink.model, sink.loop))
-            checkpoints.close()
-        sink.state = sink.sharding.adopt(restored)
-        ends.append(sink.run(2, 3))
-    return ends
-
-
-def main() -> dict[str, Any]:
-    clips = [batch(seed) for seed in range(STEPS)]
-    start = jax.device_get(jax.jit(partial(create_state, MODEL, LOOP))())
-    fresh = jax.device_get(jax.jit(partial(create_state, TOKENIZER, CONFIG.loop("tokenizer")))())
-    trainings = {kind: Training(kind, MODEL, LOOP, clips, start) for kind in SHARDINGS}
-    small = {kind: Training(kind, Small(), MUON, clips, None) for kind in ("jit", "fsdp")}
-    heads = {kind: Training(kind, HEADS, LOOP, clips, None) for kind in ("jit", "fsdp")}
-    kinds = ("jit", "pmap", "fsdp")
-    tokenizers = {kind: Training(kind, TOKENIZER, CONFIG.loop("tokenizer"), [IMAGES], fresh) for kind in kinds}
-    with ThreadPoolExecutor(2) as pool:
-        list(pool.map(Training.compiled, [*trainings.values(), *heads.values(), *tokenizers.values()]))
-
-    cut = first_device_share(trainings["fsdp"].state)
-    begun = {kind: training.sharding.gather(training.state) for kind, training in small.items()}
-    gradients = {kind: moments(training.run(0, 1)) for kind, training in trainings.items()}
-    ends = {kind: training.run(1, STEPS) for kind, training in trainings.items()}
-    of_head = {kind: moments(training.run(0, 1)) for kind, training in heads.items()}
-    muon = {kind: training.run(0, STEPS) for kind, training in small.items()}
-    images = {kind: training.run(0, 1) for kind, training in tokenizers.items()}
-    of_loss, of_depth = mean_of_ratios(start.params)
-    return {
-        **{kind: distance(ends["jit"], ends[kind], start) for kind in ("pmap", "mesh", "fsdp")},
-        **{f"gradient {kind}": share(gradients["jit"], gradients[kind]) for kind in ("pmap", "mesh", "fsdp")},
-        "gradient heads": share(of_head["jit"], of_head["fsdp"]),
-        "muon": distance(muon["jit"], muon["fsdp"], begun["jit"]),
-        "mean of ratios": of_loss,
-        "depth mean of ratios": of_depth,
-        **{f"tokenizer {kind}": moments_apart(images["jit"], images[kind]) for kind in ("pmap", "fsdp")},
-        "tokenizer apart": tokenizer_apart(fresh),
-        "checkpoint": [
-            distance(ends["jit"], end, start) for end in through_checkpoints(list(trainings.values()), start)
-        ],
-        "start": same(begun["jit"], begun["fsdp"]),
-        "cut": cut,
-    }
-
-
-if __name__ == "__main__":
-    assert jax.local_device_count() == 4
-    print(json.dumps(main()))

@@ -1,8 +1,8 @@
 """One of several processes that train together: ``python -m tests.training.hosts FOLDER [HOST:PORT PROCESSES ID]``.
 
-Without an address it joins the Slurm task that its environment describes, or trains alone on one device. Each sharding
-takes a few steps on the real loader's batches and saves a checkpoint in FOLDER/SHARDING: pmap of a small network
-(quickly compiled), fsdp of the world model. Several processes also save sharded checkpoints in FOLDER/checkpoints.
+Without an address it joins the Slurm task that its environment describes, or trains alone on one device. Under each
+sharding a small network takes a few steps on the real loader's batches and saves a checkpoint in FOLDER/SHARDING.
+Several processes also save sharded checkpoints in FOLDER/checkpoints.
 Prints, as JSON, the losses of each sharding's steps with the clips' places in the batch, and what the processes
 exchange; the lead writes each sharding's last parameters to FOLDER/SHARDING-PROCESSES.npz.
 """
@@ -20,15 +20,12 @@ from rsjax.config import LoopConfig
 from rsjax.data.loader import Arrays, batches
 from rsjax.errors import UserError
 from rsjax.models.roboscape.records import token_batch
-from rsjax.trainable import Trainable
 from rsjax.training import distributed
 from rsjax.training.checkpoint import Checkpoints
 from rsjax.training.sharding import Sharding
 from rsjax.training.step import as_numbers, train_step
 from tests.training.checkpoint_processes import save_together
-from tests.training.devices import CONFIG, LOOP, MODEL, SHARDINGS, STEPS, Small
-
-MODELS: dict[str, Trainable[Any]] = {"pmap": Small(), "fsdp": MODEL}
+from tests.training.devices import CONFIG, LOOP, SHARDINGS, STEPS, Small
 
 
 def records(count: int = 11) -> list[Arrays]:
@@ -53,7 +50,8 @@ def as_is(record: Arrays, rng: np.random.Generator) -> Arrays:
     return record
 
 
-def train(model: Trainable[Any], loop: LoopConfig, folder: Path) -> dict[str, Any]:
+def train(loop: LoopConfig, folder: Path) -> dict[str, Any]:
+    model = Small()
     sharding = Sharding.create(loop)
     state, step = sharding.init(model, loop), sharding.compile(train_step, model, loop)
     losses = []
@@ -106,8 +104,8 @@ def main(folder: Path, *address: str) -> dict[str, Any]:
     several = jax.process_count() > 1
     if several:
         save_together(folder / "checkpoints")
-    loops = {kind: replace(LOOP, **SHARDINGS[kind if several else "jit"]) for kind in MODELS}
-    trained = {kind: train(model, loops[kind], folder / kind) for kind, model in MODELS.items()}
+    loops = {kind: replace(LOOP, **SHARDINGS[kind if several else "jit"]) for kind in ("pmap", "fsdp")}
+    trained = {kind: train(loop, folder / kind) for kind, loop in loops.items()}
     return {"trained": trained, "exchanged": exchanged()}
 
 

@@ -71,7 +71,7 @@ def restored(directory: Path) -> tuple[int, str]:
 
 
 @given(which=st.floats(0, 0.999), way=st.sampled_from(WAYS), share=st.floats(0, 0.999))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=10, deadline=None)
 def test_damage_is_harmless_or_the_older_checkpoint_is_used(
     intact: Path, which: float, way: Callable[[Path, float], None], share: float
 ) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from rsjax.training.checkpoint import Checkpoints
 from tests.training.killed_while_saving import save_forever, state
 
-KILLS = 4
+KILLS = 2
 
 
 def receive(connection: Connection) -> tuple[str, int]:

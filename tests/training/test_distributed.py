@@ -93,19 +93,12 @@ def test_every_clip_knows_its_place_in_the_global_batch(results: list[Results]) 
     assert [result["trained"]["fsdp"]["index"] for result in results] == [[0, 2, 4, 6], [1, 3, 5, 7], [*range(8)]]
 
 
-def test_processes_see_their_own_devices_and_all(results: list[Results]) -> None:
-    assert [result["exchanged"]["devices"] for result in results] == [[2, 4], [2, 4], [1, 1]]
-
-
-def test_all_get_the_leads_value_and_learn_whether_any_has_to_stop(results: list[Results]) -> None:
-    for result in results[:2]:
-        assert result["exchanged"]["agree"] == {"from": 0, "text": "λ" * 300}
-        assert result["exchanged"]["anywhere"] == [True, False]
-    assert results[2]["exchanged"]["anywhere"] == [False, False]
-
-
-def test_where_the_leads_work_fails_all_fail(results: list[Results]) -> None:
-    failures = [result["exchanged"]["failed"] for result in results]
+def test_processes_see_all_devices_get_the_leads_value_and_stop_and_fail_together(results: list[Results]) -> None:
+    exchanged = [result["exchanged"] for result in results]
+    assert [each["devices"] for each in exchanged] == [[2, 4], [2, 4], [1, 1]]
+    assert [each["agree"] for each in exchanged[:2]] == [{"from": 0, "text": "λ" * 300}] * 2
+    assert [each["anywhere"] for each in exchanged] == [[True, False], [True, False], [False, False]]
+    failures = [each["failed"] for each in exchanged]
     assert failures == ["no room", "a stage failed on process 0 (UserError: no room)", "no room"]
 
 

@@ -53,7 +53,7 @@ def test_a_run_learns_and_logs_every_step(whole: tuple[TrainState, list[dict[str
     assert np.linalg.norm(state.params["w"] - truth) < np.linalg.norm(start - truth)
 
 
-@pytest.mark.parametrize("stop_at", [1, 4, 6])
+@pytest.mark.parametrize("stop_at", [4, 6])
 def test_resumed_is_never_stopped(whole: tuple[TrainState, list[dict[str, Any]]], tmp_path: Path, stop_at: int) -> None:
     stopped = train(LOOP, tmp_path, stop_at=stop_at)
     assert int(stopped.step) == stop_at

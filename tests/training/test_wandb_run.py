@@ -60,7 +60,10 @@ def stage(tmp_path: Path) -> Path:
     return directory
 
 
-def test_it_gets_the_runs_configuration_scalars_and_images(wandb: Stub, stage: Path) -> None:
+def test_it_gets_the_runs_configuration_scalars_and_images_if_there_is_a_project(wandb: Stub, stage: Path) -> None:
+    with ScalarLog(stage, 0) as log:
+        log.write(1, {"loss": 0.5})
+    assert not wandb.runs and not (stage / "wandb.json").exists()
     with ScalarLog(stage, 0, wandb="robots") as log:
         log.write(1, {"loss": 0.5})
         log.image(1, "clip_000", np.zeros((4, 6, 3), np.uint8))
@@ -82,12 +85,6 @@ def test_a_resumed_run_continues_the_same_one_but_another_project_or_a_fresh_sta
     assert first == resumed
     assert len({first, other, anew}) == 3
     assert {run.options["resume"] for run in wandb.runs} == {"allow"}
-
-
-def test_without_a_project_it_is_not_used(wandb: Stub, stage: Path) -> None:
-    with ScalarLog(stage, 0) as log:
-        log.write(1, {"loss": 0.5})
-    assert not wandb.runs and not (stage / "wandb.json").exists()
 
 
 def test_a_failed_training_is_shown_as_one(wandb: Stub, stage: Path) -> None:

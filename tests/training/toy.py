@@ -1,7 +1,7 @@
 """A linear regression with noise drawn from the step's key: what a training loop has to get right, in no time."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -25,11 +25,11 @@ class Regression(Trainable[Any]):
 
     Attributes:
         inputs: how many numbers of x it reads.
-        to_batch: changes the loader's arrays.
+        to_batch: changes the loader's arrays; it has no part in the compiled step.
     """
 
     inputs: int = 3
-    to_batch: Callable[[Arrays], Arrays] = dict
+    to_batch: Callable[[Arrays], Arrays] = field(default=dict, compare=False)
 
     @property
     def loss_weights(self) -> dict[str, float]:

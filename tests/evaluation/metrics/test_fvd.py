@@ -42,13 +42,6 @@ def test_fewer_videos_than_features() -> None:
     assert frechet_distance(one, other) == pytest.approx(expected, rel=1e-4)
 
 
-def test_one_feature_by_hand_and_a_set_with_itself() -> None:
-    """Means 1 and 4, deviations 1 and 3: (1 - 4)² + (1 - 3)²."""
-    assert frechet_distance(np.array([[0.0], [2.0]]), np.array([[1.0], [7.0]])) == pytest.approx(9 + 4)
-    same = features(20, 5, 4)
-    assert frechet_distance(same, same[::-1]) == pytest.approx(0, abs=1e-9)
-
-
 @pytest.fixture(scope="module")
 def network(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A network that is called as I3D is, of which features are means over channels, first frame and last frame."""
@@ -83,6 +76,8 @@ def test_the_network_sees_the_predicted_frames_as_channels_first_videos(network:
     expected = frechet_distance(seen(given.truth), seen(given.prediction))
     assert score("fvd", given) == pytest.approx(expected, rel=1e-3)
     assert score("fvd", Scene(given.truth, given.truth, settings=given.settings)) == pytest.approx(0, abs=1e-6)
+    with pytest.raises(Unavailable, match="I3D refuses 2 frames of a clip"):
+        score("fvd", scene(given.settings, frames=4))
 
 
 class Numbers:
@@ -127,11 +122,6 @@ def test_another_network_at_the_same_path_is_read_anew(tmp_path: Path, monkeypat
         (tmp_path / FILE).write_text(scale)
         values.append(score("fvd", scene(EvalConfig(weights=str(tmp_path)))))
     assert values[1] == pytest.approx(4 * values[0], rel=1e-3)
-
-
-def test_clips_that_are_too_short_have_a_reason(network: Path) -> None:
-    with pytest.raises(Unavailable, match="I3D refuses 2 frames of a clip"):
-        score("fvd", scene(EvalConfig(weights=str(network.parent)), frames=4))
 
 
 def test_without_network_or_torch_there_is_a_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

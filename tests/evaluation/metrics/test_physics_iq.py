@@ -11,7 +11,6 @@ from rsjax.evaluation.metrics.physics_iq import (
     Four,
     Small,
     four_metrics,
-    grey,
     motion_masks,
     physics_iq_score,
     shrink,
@@ -63,9 +62,8 @@ def dilated(mask: np.ndarray) -> np.ndarray:
     return np.asarray(windows(mask, "constant", outside=False).any((-2, -1)))
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_masks_are_the_definitions_bit_by_bit(seed: int) -> None:
-    frames = drifting(seed)
+def test_masks_are_the_definitions_bit_by_bit() -> None:
+    frames = drifting(0)
     got = motion_masks(frames)
     np.testing.assert_array_equal(got, masks_by_definition(frames))
     assert 0.02 < got[1:].mean() < 0.6
@@ -172,13 +170,6 @@ def test_scenes_of_one_truth_share_its_masks() -> None:
     for seed in (1, 2):
         score("physics_iq_mse", Scene(truth, Video(drifting(seed)[None]), truth_cache=cache))
     assert len(cache) == 1
-
-
-def test_grey_is_upright_and_rgb() -> None:
-    image = np.zeros((8, 8, 3), np.uint8)
-    image[:4] = (255, 0, 0)
-    assert grey(image)[0, 0] == 76  # 0.299 of 255
-    assert grey(image)[7, 7] == 0
 
 
 def test_masks_as_published_pass_through_a_lossy_video() -> None:

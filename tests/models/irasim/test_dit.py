@@ -73,7 +73,7 @@ def test_export_returns_the_public_file(variant: str) -> None:
         assert exported[name].tobytes() == x.tobytes(), name
 
 
-@pytest.mark.parametrize("grid", [(3, 8), (8, 3), (2, 12), (1, 24), (18, 32)])
+@pytest.mark.parametrize("grid", [(3, 8), (8, 3), (1, 24), (18, 32)])
 def test_the_files_positions_identify_its_grid(grid: tuple[int, int]) -> None:
     net = public.Network(depth=2, grid=grid)
     config, params, _ = from_public("file", public.random_weights(net), variant=variant_of(net))
@@ -93,8 +93,7 @@ def test_bf16_rounds_and_neither_remat_nor_unrolling_changes_anything() -> None:
 
     plain, rounded = out(), out(compute_dtype="bfloat16")
     assert 0 < np.abs(rounded - plain).max() < 0.05 * np.abs(plain).max()
-    for same in ({"remat": "blocks"}, {"unroll": 8}, {"unroll": 2, "remat": "blocks"}):
-        np.testing.assert_allclose(out(**same), plain, atol=1e-6)
+    np.testing.assert_allclose(out(unroll=8, remat="blocks"), plain, atol=1e-6)
 
 
 @pytest.mark.parametrize(

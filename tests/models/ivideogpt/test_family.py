@@ -40,7 +40,6 @@ def test_operations_by_formula_are_those_of_the_traced_program(config: Config) -
 @pytest.mark.parametrize(
     ("values", "line"),
     [
-        ({"model.autoencoder.future_patch": 3}, "64 pixels a side, which 24 does not divide"),
         ({"model.positions": 80}, r"6 frames has 89 tokens, but model.positions is 80; raise it"),
         ({"model.autoencoder.context_frames": 6}, "6 frames, of which model.autoencoder.context_frames 6 are context"),
         ({"model.heads": 3}, "model.width 16 is not divisible by 2 × model.heads"),

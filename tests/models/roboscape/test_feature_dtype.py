@@ -34,14 +34,6 @@ def test_logits_and_gradients_are_those_of_float32_to_rounding() -> None:
         np.testing.assert_allclose(x, y, atol=0.05 * float(jnp.max(jnp.abs(y))) + 1e-6)
 
 
-def test_a_program_for_a_cpu_keeps_features_in_float32() -> None:
-    params = random_params(WIDE)
-    arguments = random_inputs(WIDE)
-    expected = Transformer(WIDE).apply({"params": params}, *arguments)[0]
-    found = run_transformer(WIDE, params, *arguments)[0]
-    jax.tree.map(np.testing.assert_array_equal, found, expected)
-
-
 def test_a_program_for_a_gpu_has_features_in_bf16() -> None:
     run = partial(run_transformer, WIDE)
     operands = random_params(WIDE), *random_inputs(WIDE)

@@ -12,13 +12,10 @@ from rsjax.config import Config, CorruptionConfig, GenieConfig, LossConfig, NoDe
 from rsjax.models.base import create_model
 from rsjax.models.genie.model import Genie
 from rsjax.models.roboscape.architecture import Architecture
-from rsjax.models.roboscape.flops import forward_flops
 from rsjax.models.roboscape.model import RoboScape
-from rsjax.models.roboscape.transformer import Transformer
-from rsjax.tokenizers.flops import products
 from rsjax.tools.bench import inputs
 from rsjax.trainable import Params, StepContext
-from tests.models.roboscape.toy import BATCH, RGB, apply, apply_plain, random_inputs, random_params
+from tests.models.roboscape.toy import BATCH, RGB, apply, random_inputs, random_params
 
 MLP = replace(RGB, action_encoder="mlp")
 ENCODER = {"action_encoder_fc1", "action_encoder_fc2"}
@@ -59,12 +56,7 @@ def test_fresh_logits_are_those_of_the_same_parameters_without_actions(fresh: Pa
 def test_actions_count_once_the_last_layer_has_changed(fresh: Params) -> None:
     actions = random_inputs(MLP)[2]
     changed = fresh | {"action_encoder_fc2": random_params(MLP)["action_encoder_fc2"]}
-    before, after = logits(MLP, changed, actions), logits(MLP, changed, actions + 1)
-    assert np.abs(after - before).max() > 0.1
-    later = actions.copy()
-    later[:, -1] += 1
-    np.testing.assert_array_equal(logits(MLP, changed, later)[:, :-1], before[:, :-1])
-    assert np.any(logits(MLP, changed, later)[:, -1] != before[:, -1])
+    assert np.abs(logits(MLP, changed, actions + 1) - logits(MLP, changed, actions)).max() > 0.1
 
 
 def test_training_can_move_the_last_layer_away_from_zero(fresh: Params) -> None:
@@ -76,10 +68,9 @@ def test_training_can_move_the_last_layer_away_from_zero(fresh: Params) -> None:
     assert jax.jit(jax.grad(loss))(fresh)["action_encoder_fc2"]["kernel"].any()
 
 
-@pytest.mark.parametrize("encoder", ["none", "mlp"])
-def test_its_parameters_and_loss_are_those_of_the_rgb_branch(encoder: Any) -> None:
+def test_its_parameters_and_loss_are_those_of_the_rgb_branch() -> None:
     corruption = CorruptionConfig(probability=1.0)
-    small: dict[str, Any] = {"width": 8, "blocks": 1, "heads": 2, "corruption": corruption, "action_encoder": encoder}
+    small: dict[str, Any] = {"width": 8, "blocks": 1, "heads": 2, "corruption": corruption, "action_encoder": "mlp"}
     genie = create_model(debug(GenieConfig(**small)))
     loss = LossConfig(keypoints="none")
     alone = create_model(debug(RoboScapeConfig(depth=NoDepth(), loss=loss, **small)))
@@ -87,7 +78,7 @@ def test_its_parameters_and_loss_are_those_of_the_rgb_branch(encoder: Any) -> No
     assert genie.loss_weights == alone.loss_weights == {"rgb": 1.0}
     shapes, expected = (jax.eval_shape(model.init, jax.random.key(0)) for model in (genie, alone))
     assert jax.tree.map(jnp.shape, shapes) == jax.tree.map(jnp.shape, expected)
-    assert shapes.keys() - {"pos_embed", "rgb_embed", "blocks", "rgb_head"} == (ENCODER if encoder == "mlp" else set())
+    assert shapes.keys() - {"pos_embed", "rgb_embed", "blocks", "rgb_head"} == ENCODER
 
     rng = np.random.default_rng(0)
     params = jax.tree.map(lambda x: rng.normal(scale=0.3, size=x.shape).astype(np.float32), shapes)
@@ -99,14 +90,6 @@ def test_its_parameters_and_loss_are_those_of_the_rgb_branch(encoder: Any) -> No
     jax.tree.map(np.testing.assert_array_equal, *terms)
     assert terms[0].keys() == {"rgb"}
     assert all(np.all(x > 0) for x in jax.tree.leaves(terms))
-
-
-@pytest.mark.parametrize("network", [MLP, replace(MLP, action_inputs=0), WITHOUT], ids=["mlp", "no inputs", "none"])
-def test_operations_by_formula_are_those_of_the_traced_program(network: Architecture) -> None:
-    params = jax.eval_shape(Transformer(network).init_params, jax.random.key(0))
-    tokens, mask, actions = jax.tree.map(lambda x: x[:1], random_inputs(network))
-    traced = jax.make_jaxpr(lambda params: apply_plain(network, params, tokens, mask, actions))(params)
-    assert products(traced.jaxpr) == forward_flops(network, network.frames)
 
 
 def test_every_preset_of_a_family_makes_that_family() -> None:

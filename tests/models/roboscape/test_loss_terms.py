@@ -19,7 +19,7 @@ from rsjax.models.roboscape.transformer import Transformer, run_transformer, run
 from rsjax.tokenizers.flops import products
 from rsjax.trainable import StepContext, Term
 from rsjax.training.step import combine
-from tests.models.roboscape.toy import depart, roboscape
+from tests.models.roboscape.toy import depart, random_params, roboscape
 
 MODEL = Architecture(frames=4, grid=2, code_bits=4, action_inputs=3, width=8, blocks=1, heads=2)
 CORRUPTION, LOSS = CorruptionConfig(), LossConfig(num_keypoints=3)
@@ -37,12 +37,6 @@ def terms_of(architecture: Architecture, loss: LossConfig, params: Any, batch: B
     return model_of(architecture, loss).loss_terms(params, batch, KEY, CONTEXT)
 
 
-def random_params(model: Architecture) -> Any:
-    rng = np.random.default_rng(1)
-    shapes = jax.eval_shape(Transformer(model).init_params, jax.random.key(0))
-    return jax.tree.map(lambda x: rng.normal(scale=0.3, size=x.shape).astype(np.float32), shapes)
-
-
 def random_batch(clips: int = 3) -> Batch:
     rng = np.random.default_rng(2)
     tokens = [rng.integers(0, 2**MODEL.code_bits, (clips, 4, 2, 2), np.int32) for _ in range(2)]
@@ -58,29 +52,34 @@ def random_batch(clips: int = 3) -> Batch:
     return Batch(**fields)
 
 
-@pytest.mark.parametrize("depth", ["branch", "head", "none"])
-@pytest.mark.parametrize("keypoints", ["none", "printed", "difference", "motion", "feature"])
-def test_what_is_off_has_no_term(depth: Any, keypoints: Any) -> None:
-    model = replace(MODEL, depth=depth, motion_head=keypoints == "motion")
-    loss = replace(LOSS, keypoints=keypoints)
+@pytest.mark.parametrize(
+    ("depth", "settings", "names"),
+    [
+        ("branch", {"keypoints": "none"}, {"depth"}),
+        ("none", {"keypoints": "difference"}, {"keypoint", "attention"}),
+        ("branch", {"keypoints": "motion", "attention_weight": 0.0}, {"depth", "keypoint"}),
+        ("head", {"keypoints": "feature", "keypoint_weight": 0.0}, {"depth", "attention"}),
+        ("head", {"keypoint_weight": 0.0, "attention_weight": 0.0, "depth_weight": 0.0}, set()),
+    ],
+)
+def test_what_is_off_or_has_a_weight_of_0_has_no_term(depth: Any, settings: dict[str, Any], names: set[str]) -> None:
+    model = replace(MODEL, depth=depth, motion_head=settings.get("keypoints") == "motion")
+    loss = replace(LOSS, **settings)
     shapes = jax.eval_shape(Transformer(model).init_params, KEY)
     terms = jax.eval_shape(partial(terms_of, model, loss), shapes, random_batch())
-    assert terms.keys() == model_of(model, loss).loss_weights.keys()
-    assert ("depth" in terms) == (depth != "none")
-    assert ("keypoint" in terms) == ("attention" in terms) == (keypoints != "none")
+    assert terms.keys() == model_of(model, loss).loss_weights.keys() == {"rgb"} | names
+
+
+corrupt = jax.jit(partial(masking.corrupt, CORRUPTION, 0.0, 1, MODEL.code_bits, MODEL.vocabularies))
 
 
 @pytest.mark.parametrize("model", [MODEL, replace(MODEL, depth="head")], ids=["branch", "head"])
-@pytest.mark.parametrize("has_depth", [None, (1, 0, 1), (0, 0, 0)])
-def test_each_modality_is_scored_on_its_own_clean_tokens_where_masked(
-    has_depth: tuple[int, ...] | None, model: Architecture
-) -> None:
+def test_each_modality_is_scored_on_its_own_clean_tokens_where_masked(model: Architecture) -> None:
     """Of clips without depth RGB alone, by a model to which all their depth is hidden."""
-    params, batch = random_params(model), random_batch()
-    has = np.ones(3, np.float32) if has_depth is None else np.array(has_depth, np.float32)
-    batch = batch.replace(has_depth=None if has_depth is None else has)  # type: ignore[attr-defined]
+    has = np.array([1, 0, 1], np.float32)
+    params = random_params(model)
+    batch = random_batch().replace(has_depth=has)  # type: ignore[attr-defined]
     clean = {name: jnp.asarray(getattr(batch, name)) for name in model.modalities}
-    corrupt = jax.jit(partial(masking.corrupt, CORRUPTION, 0.0, 1, model.code_bits, model.vocabularies))
     given = corrupt(KEY, clean, batch.index)
     inputs = (given.tokens, given.mask, batch.actions)
     logits, _ = jax.jit(Transformer(model).apply)({"params": params}, *inputs, no_depth=has == 0)
@@ -119,8 +118,11 @@ def test_whole_frames_are_scored_in_every_cell_after_the_first_frame() -> None:
     assert scored["rgb"] == scored["depth"] == scored["attention"] == batch.weight.sum() * frames * cells
 
 
-def objective(params: Any, batch: Batch) -> tuple[Any, Any]:
-    return combine(terms_of(MODEL, LOSS, params, batch), model_of(MODEL, LOSS).loss_weights)
+WEIGHTS = model_of(MODEL, LOSS).loss_weights
+
+
+def objective(params: Any, batch: Batch, weights: dict[str, float]) -> tuple[Any, Any]:
+    return combine(terms_of(MODEL, LOSS, params, batch), weights)
 
 
 GRADIENT = jax.jit(jax.value_and_grad(objective, has_aux=True))
@@ -130,12 +132,13 @@ def test_where_every_clip_has_depth_it_is_as_if_nothing_was_said() -> None:
     params, batch = random_params(MODEL), random_batch()
     told = batch.replace(has_depth=np.ones(3, np.float32))  # type: ignore[attr-defined]
     close = partial(np.testing.assert_allclose, rtol=1e-5, atol=1e-6)  # two programs, which may round differently
-    jax.tree.map(close, GRADIENT(params, told), GRADIENT(params, batch))
+    jax.tree.map(close, GRADIENT(params, told, WEIGHTS), GRADIENT(params, batch, WEIGHTS))
 
 
 def test_of_a_batch_without_depth_the_branch_learns_by_what_it_tells_rgb_alone() -> None:
     params, batch = random_params(MODEL), random_batch()
-    (loss, shares), gradient = GRADIENT(params, batch.replace(has_depth=np.zeros(3, np.float32)))  # type: ignore[attr-defined]
+    none = batch.replace(has_depth=np.zeros(3, np.float32))  # type: ignore[attr-defined]
+    (loss, shares), gradient = GRADIENT(params, none, WEIGHTS)
     assert shares["depth"] == 0
     assert np.isfinite(loss)
     assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves(gradient))
@@ -151,12 +154,12 @@ def test_depth_tokens_of_a_clip_without_depth_change_nothing() -> None:
     has = np.array([1, 0, 1], np.float32)
     other = np.r_[batch.depth[:1], batch.depth[1:2] ^ 15, batch.depth[2:]]
     before, after = (
-        GRADIENT(params, batch.replace(has_depth=has, depth=depth))  # type: ignore[attr-defined]
+        GRADIENT(params, batch.replace(has_depth=has, depth=depth), WEIGHTS)  # type: ignore[attr-defined]
         for depth in (batch.depth, other)
     )
     jax.tree.map(np.testing.assert_array_equal, before, after)
-    all_told = GRADIENT(params, batch.replace(has_depth=np.ones(3, np.float32)))  # type: ignore[attr-defined]
-    assert all_told[0][1]["rgb"] != before[0][1]["rgb"]
+    all_told = batch.replace(has_depth=np.ones(3, np.float32))  # type: ignore[attr-defined]
+    assert GRADIENT(params, all_told, WEIGHTS)[0][1]["rgb"] != before[0][1]["rgb"]
 
 
 def test_a_padding_clip_changes_nothing() -> None:
@@ -177,13 +180,10 @@ def test_a_padding_clip_changes_nothing() -> None:
 
 def test_rgb_terms_teach_the_depth_branch_and_not_the_other_way_round() -> None:
     params, batch = random_params(MODEL), random_batch()
-    gradient = jax.jit(jax.jacrev(lambda p: {k: v[0] for k, v in terms_of(MODEL, LOSS, p, batch).items()}))(params)
-    reaches = lambda term, part: bool(np.any(gradient[term]["blocks"][part]["fc1"]["kernel"]))  # noqa: E731
-    for term in ("rgb", "keypoint", "attention"):
-        assert reaches(term, "rgb")
-        assert reaches(term, "depth")  # through the projection of Eq. 3
-    assert reaches("depth", "depth")
-    assert not reaches("depth", "rgb")
+    for term in WEIGHTS:
+        _, gradient = GRADIENT(params, batch, dict.fromkeys(WEIGHTS, 0.0) | {term: 1.0})
+        assert np.any(gradient["blocks"]["depth"]["fc1"]["kernel"])  # of RGB's through the projection of Eq. 3
+        assert np.any(gradient["blocks"]["rgb"]["fc1"]["kernel"]) == (term != "depth")
 
 
 @pytest.mark.parametrize("keypoints", ["motion", "feature"])
@@ -225,5 +225,3 @@ def test_training_on_dropped_actions_teaches_the_null_action_and_the_encoder() -
     gradient = jax.jit(jax.grad(lambda params: terms_of(model, loss, params, batch)["rgb"][0]))(params)
     assert np.any(gradient["null_action"])
     assert np.any(gradient["action_encoder"]["kernel"])
-    plain = terms_of(MODEL, loss, {k: x for k, x in params.items() if k != "null_action"}, batch)
-    assert plain["rgb"][0] != terms_of(model, loss, params, batch)["rgb"][0]

@@ -85,19 +85,15 @@ def test_cross_entropy_of_a_token_is_that_of_the_whole_vocabulary() -> None:
     np.testing.assert_allclose(cross_entropy()[1, 2, 0, 1], -log_p(1, 2, 0, 1), rtol=1e-5)
 
 
-@pytest.mark.parametrize("name", ["rgb", "depth"])
-def test_rgb_and_depth_are_equation_4(name: str) -> None:
-    assert_term(terms()[name], plain_cross_entropy(np.ones((B, T, GRID, GRID))))
+def test_rgb_and_depth_are_equation_4() -> None:
+    found = terms()
+    for name in ("rgb", "depth"):
+        assert_term(found[name], plain_cross_entropy(np.ones((B, T, GRID, GRID))))
 
 
 def test_attention_is_equation_7() -> None:
     attention = np.asarray(attention_map(KEYPOINTS, GRID, 5.0))
     assert_term(terms(visible_keypoints=True)["attention"], plain_cross_entropy(attention))
-
-
-def test_a_flat_attention_map_gives_the_rgb_term() -> None:
-    flat = terms(gamma=1.0)
-    assert flat["attention"] == flat["rgb"]
 
 
 def plain_mean_codes() -> np.ndarray:
@@ -134,11 +130,13 @@ def test_keypoints_are_equation_5_where_they_count(observed: bool) -> None:
     assert_term(found["keypoint"], (total, weight))
 
 
-@pytest.mark.parametrize("name", ["roboscape_s", "roboscape_m", "roboscape_l"])
-def test_the_full_size_presets_have_the_printed_keypoint_terms(name: str) -> None:
+def test_the_full_size_presets_have_the_printed_keypoint_terms() -> None:
     """M_i over all frames, Eq. 5 with ŝ_1 and all cells, divided by (T-1)K, and Eq. 6 wherever a track passes."""
-    model = presets.get(name).model
+    model, *others = (presets.get(f"roboscape_{size}").model for size in ("s", "m", "l"))
     assert isinstance(model, RoboScapeConfig)
+    for other in others:
+        assert isinstance(other, RoboScapeConfig)
+        assert (other.loss, other.departures) == (model.loss, model.departures)
     k = 3
     config = replace(model, loss=replace(model.loss, num_keypoints=k))
     visible = np.array(KEYPOINTS.visible)
@@ -167,18 +165,6 @@ def test_a_track_that_begins_hidden_does_not_exist() -> None:
     assert absent["attention"] == absent["rgb"]
 
 
-def test_a_hidden_point_counts_nowhere_with_visible_keypoints() -> None:
-    visible = np.array(KEYPOINTS.visible)
-    visible[:, :, 0] = True
-    config = RoboScapeConfig(departures=Departures(visible_keypoints=True))
-    moved = np.where(visible, KEYPOINTS.cells, 0)
-    before, after = (
-        terms_of(config, tracks_of(cells), visible, np.ones(B, np.float32)) for cells in (KEYPOINTS.cells, moved)
-    )
-    for name in ("keypoint", "attention"):
-        np.testing.assert_allclose(before[name], after[name], rtol=1e-6)
-
-
 def test_the_objective_is_equation_8() -> None:
     weights = RoboScapeConfig().loss_weights
     assert weights == {"rgb": 1, "depth": 1, "keypoint": 0.01, "attention": 1}  # the paper's λ
@@ -203,7 +189,7 @@ def test_a_term_without_weight_is_nothing_rather_than_no_number() -> None:
     assert (value, gradient) == (0, 0)
 
 
-@pytest.mark.parametrize("terms", [{"rgb"}, {"rgb", "depht"}, {"rgb", "depth", "keypoint"}], ids=sorted)
+@pytest.mark.parametrize("terms", [{"rgb"}, {"rgb", "depth", "keypoint"}], ids=sorted)
 def test_terms_and_weights_must_have_the_same_names(terms: set[str]) -> None:
     with pytest.raises(KeyError, match="rgb"):
         combine({name: (jnp.float32(1), jnp.float32(1)) for name in terms}, {"rgb": 1.0, "depth": 1.0})

@@ -16,20 +16,13 @@ from rsjax.models.roboscape.transformer import Transformer
 from rsjax.tools.convert.directory import save
 from rsjax.tools.convert.genie import from_public
 from rsjax.training.checkpoint import load_weights, save_weights
-from tests.models.roboscape.toy import depart
+from tests.models.roboscape.toy import depart, random_params
 from tests.tools.convert.public import genie_shapes, random_tensors
 
 ALONE = Architecture(frames=3, grid=2, code_bits=4, action_inputs=0, width=8, blocks=2, heads=2, depth="none")
 BOTH = PublicCodeConfig(qk_norm=True, mup=True)
 MUP = PublicCodeConfig(mup=True)
 DUAL = depart(replace(ALONE, depth="branch", action_inputs=5), action_dropout=0.1)
-
-
-def random_params(network: Architecture, seed: int = 0) -> Any:
-    """Parameters without a zero among them, so that what has to be zero is made so where it is tested."""
-    rng = np.random.default_rng(seed)
-    shapes = jax.eval_shape(Transformer(network).init_params, jax.random.key(0))
-    return jax.tree.map(lambda x: rng.normal(scale=0.4, size=x.shape).astype(np.float32), shapes)
 
 
 def begin(own: Architecture, directory: Path, fresh: Any = None) -> Any:
@@ -57,17 +50,20 @@ def public(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize(
-    "options",
+    ("depth", "options"),
     [
-        {},
-        {"public_code": BOTH},
-        {"compute_dtype": "bfloat16"},
-        {"action_encoder": "mlp"},
-        {"action_encoder": "norms"},
+        ("branch", {"compute_dtype": "bfloat16"}),
+        ("small branch", {"public_code": BOTH}),
+        ("small branch", {"action_encoder": "norms"}),
+        ("head", {"action_encoder": "mlp"}),
     ],
-    ids=["plain", "qk-norm and muP", "bfloat16", "MLP of actions", "adaptive norms"],
+    ids=[
+        "branch in bfloat16",
+        "small branch with qk-norm and muP",
+        "small branch with adaptive norms",
+        "head with MLP",
+    ],
 )
-@pytest.mark.parametrize("depth", ["branch", "small branch", "head"])
 def test_a_model_with_depth_begins_with_the_very_logits_of_the_genie_it_starts_from(
     depth: Any, options: dict[str, Any], tmp_path: Path
 ) -> None:

@@ -4,7 +4,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 import pytest
 
@@ -17,23 +16,19 @@ from rsjax.evaluation.metrics.psnr import psnr
 from rsjax.models.roboscape import objective, pretrained
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.departures.second_view import NoSecondView
-from rsjax.models.roboscape.flops import forward_flops
 from rsjax.models.roboscape.objective import Batch
 from rsjax.models.roboscape.sample import rollout
 from rsjax.models.trained import TrainedModel
 from rsjax.tokenizers import lfq
 from rsjax.tools.convert.directory import save
 from tests.models.roboscape.toy import depart, forward, random_inputs
-from tests.models.roboscape.toy_sample import BATCH, DUAL, HEAD, KEY, RGB, given, random_params
+from tests.models.roboscape.toy_sample import BATCH, HEAD, KEY, RGB, given, random_params
 from tests.tools.pipeline import toy
 
-MODELS = {
-    "head": depart(replace(HEAD, second_view=True), read_previous=True, whole_frames=True),
-    "branch": replace(DUAL, second_view=True),
-    "none": replace(RGB, second_view=True),
-}
+ONE = depart(HEAD, read_previous=True, whole_frames=True)
+TWO = replace(ONE, second_view=True)
+ALONE = replace(RGB, second_view=True)
 MEANS = SampleConfig(steps=1, mean_codes=True, read_means=True)
-NOISY = SampleConfig(steps=2, temperature=1.0)
 
 
 def with_view(config: Config) -> Config:
@@ -65,72 +60,52 @@ def trained(stores: tuple[Store, Store]) -> TrainedModel:
     return toy.trained(stores[1], with_view(toy.with_model(toy.config(), sample=MEANS)))
 
 
-@pytest.mark.parametrize(("name", "sample"), [("head", MEANS), ("branch", NOISY)], ids=["head", "branch"])
-def test_a_cached_rollout_is_one_that_recomputes_every_pass(name: str, sample: SampleConfig) -> None:
-    model = MODELS[name]
-    params, (tokens, actions) = random_params(model), given(model, 2)
-    cached, plain = (rollout(model, sample, params, tokens, actions, KEY, cached=each) for each in (True, False))
-    assert cached.keys() == set(model.modalities)
+def test_a_cached_rollout_is_one_that_recomputes_every_pass() -> None:
+    params, (tokens, actions) = random_params(TWO), given(TWO, 2)
+    cached, plain = (rollout(TWO, MEANS, params, tokens, actions, KEY, cached=each) for each in (True, False))
+    assert cached.keys() == set(TWO.modalities)
     for branch, grid in cached.items():
         np.testing.assert_allclose(grid, plain[branch], atol=1e-4, err_msg=branch)
         assert np.ptp(np.asarray(grid)[:, 2:]) > 0
 
 
-@pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
-def test_each_view_is_predicted_from_both(model: Architecture) -> None:
-    params, (tokens, mask, actions) = random_params(model), random_inputs(model)
-    both = forward(model, params, (tokens, mask, actions))
+def test_each_view_is_predicted_from_both() -> None:
+    params, (tokens, mask, actions) = random_params(TWO), random_inputs(TWO)
+    both = forward(TWO, params, (tokens, mask, actions))
     for changed in ("rgb", "second"):
-        other = forward(model, params, (tokens | {changed: tokens[changed] ^ 9}, mask, actions))
+        other = forward(TWO, params, (tokens | {changed: tokens[changed] ^ 9}, mask, actions))
         for name in ("rgb", "second"):
             assert np.abs(other[name] - both[name]).max() > 0.01
 
 
-def test_views_without_an_embedding_change_nothing() -> None:
-    """What a second view adds to the RGB branch is its embedding, and what it costs is its head."""
-    model, one = MODELS["head"], replace(MODELS["head"], second_view=False)
-    params, (tokens, mask, actions) = random_params(model), random_inputs(model)
-    embeddings = ("second_embed", "second_previous_embed")
-    silent = params | {name: jax.tree.map(np.zeros_like, params[name]) for name in embeddings}
-    alone = {name: part for name, part in params.items() if not name.startswith("second")}
-    single = forward(one, alone, ({name: tokens[name] for name in ("rgb", "depth")}, mask, actions))
-    double = forward(model, silent, (tokens, mask, actions))
-    for name, logits in single.items():
-        np.testing.assert_array_equal(double[name], logits)
-    head = 2 * 6 * model.grid**2 * model.width * model.vocabularies * model.vocabulary_size
-    assert forward_flops(model, 6) - forward_flops(one, 6) == head
-
-
 def test_training_continues_a_model_of_one_view(tmp_path: Path) -> None:
-    one = replace(HEAD, action_inputs=5)
-    save(tmp_path, one, random_params(one))
-    own = replace(one, second_view=True)
-    saved = random_params(one)
-    assert pretrained.shapes(own, tmp_path).keys() == saved.keys()
-    params = pretrained.start(random_params(own), saved, tmp_path)
-    tokens, mask, actions = random_inputs(own)
-    begun = forward(own, params, (tokens, mask, actions))
-    single = forward(one, saved, ({name: tokens[name] for name in ("rgb", "depth")}, mask, actions))
-    np.testing.assert_array_equal(begun["rgb"], single["rgb"])
+    saved = random_params(ONE)
+    save(tmp_path, ONE, saved)
+    assert pretrained.shapes(TWO, tmp_path).keys() == saved.keys()
+    params = pretrained.start(random_params(TWO), saved, tmp_path)
+    tokens, mask, actions = random_inputs(TWO)
+    begun = forward(TWO, params, (tokens, mask, actions))
+    single = forward(ONE, saved, ({name: tokens[name] for name in ("rgb", "depth")}, mask, actions))
+    for name, logits in single.items():
+        np.testing.assert_array_equal(begun[name], logits)
 
 
 def test_its_loss_is_the_cross_entropy_of_its_masked_tokens() -> None:
-    model = MODELS["none"]
     config = GenieConfig()
-    inputs: Any = random_inputs(model)
+    inputs: Any = random_inputs(ALONE)
     tokens, mask, actions = inputs
-    shape = (BATCH, model.frames, model.grid**2, model.vocabularies, model.vocabulary_size)
-    logits: Any = {name: np.random.default_rng(i).normal(size=shape) for i, name in enumerate(model.modalities)}
-    tracks = np.zeros((BATCH, 1, model.frames, 2), np.float32)
+    shape = (BATCH, ALONE.frames, ALONE.grid**2, ALONE.vocabularies, ALONE.vocabulary_size)
+    logits: Any = {name: np.random.default_rng(i).normal(size=shape) for i, name in enumerate(ALONE.modalities)}
+    tracks = np.zeros((BATCH, 1, ALONE.frames, 2), np.float32)
     weight = np.array([1, 0], np.float32)  # the second clip is padding
     seen = np.ones(tracks.shape[:3], bool)
     batch = Batch(
         tokens["rgb"], tokens["rgb"], actions, tracks, seen, weight, np.arange(BATCH), second=tokens["second"]
     )
-    terms = objective.loss_terms(config, model, logits, tokens, mask, batch)
-    assert terms.keys() == objective.loss_weights(config, model).keys() == {"rgb", "second"}
+    terms = objective.loss_terms(config, ALONE, logits, tokens, mask, batch)
+    assert terms.keys() == objective.loss_weights(config, ALONE).keys() == {"rgb", "second"}
     for name in terms:
-        nats = lfq.token_cross_entropy(logits[name], tokens[name], model.code_bits)
+        nats = lfq.token_cross_entropy(logits[name], tokens[name], ALONE.code_bits)
         np.testing.assert_allclose(terms[name][0], np.sum((nats * mask)[0]), rtol=1e-5)
         assert terms[name][1] == mask[0].sum()
 

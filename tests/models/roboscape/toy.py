@@ -22,9 +22,6 @@ def depart(architecture: Architecture, **departures: Any) -> Architecture:
 DUAL = Architecture(frames=5, grid=2, code_bits=4, action_inputs=3, width=8, blocks=2, heads=2)
 RGB = replace(DUAL, depth="none")
 HEAD = replace(DUAL, depth="head")
-UNREAD = replace(HEAD, reads_depth=False)
-NARROW = replace(DUAL, depth_width=4)
-SHALLOW = replace(DUAL, depth_blocks=1)
 COARSE = replace(DUAL, depth_cells=2)
 NORMED = depart(DUAL, more_norms=True)
 QK_NORM = replace(DUAL, public_code=PublicCodeConfig(qk_norm=True, mup=True))
@@ -68,9 +65,9 @@ def apply_plain(
 apply = jax.jit(apply_plain, static_argnums=0)
 
 
-def random_params(config: Architecture) -> Any:
+def random_params(config: Architecture, seed: int = 0) -> Any:
     """Parameters without a zero among them, so that nothing hides behind an initial value."""
-    rng = np.random.default_rng(0)
+    rng = np.random.default_rng(seed)
     shapes = jax.eval_shape(Transformer(config).init_params, jax.random.key(0))
     return jax.tree.map(lambda x: rng.normal(scale=0.4, size=x.shape).astype(np.float32), shapes)
 

@@ -69,7 +69,7 @@ def test_a_run_directory_stands_for_its_configuration_where_that_is_allowed(tmp_
     assert "unknown preset" in str(refused.value)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(st.lists(st.sampled_from(numbers(presets.get("debug"))), unique=True))
 def test_flags_that_repeat_the_preset_change_nothing(flags: list[tuple[str, str]]) -> None:
     argv = [word for pair in flags for word in pair]

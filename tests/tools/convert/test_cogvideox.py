@@ -112,39 +112,29 @@ def test_a_network_without_channels_for_an_image_gets_empty_ones() -> None:
 
 def test_files_of_something_else_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     vae, settings = autoencoder()
-    genie = written(tmp_path / "genie", GENIE, None)
-    assert "holds no network of CogVideoX, such as" in refused(capsys, "cogvideox", genie, tmp_path / "o")
-    newer = transformer(NET) | {"patch_embed.proj.weight": np.zeros((32, 96), np.float32)}
-    path = written(tmp_path / "newer", newer, None)
-    assert "has 2 axes, as in CogVideoX 1.5; pass 1.0's" in refused(capsys, "cogvideox", path, tmp_path / "o")
-    path = written(tmp_path / "swapped", vae, cogvideox.transformer_settings(NET))
-    assert "is no CogVideoXTransformer3DModel" in refused(capsys, "cogvideox", path, tmp_path / "o")
-    path = written(tmp_path / "other", vae, {"_class_name": "AutoencoderKL"})
-    assert "describes AutoencoderKL, not" in refused(capsys, "cogvideox", path, tmp_path / "o")
-    path = written(tmp_path / "factor", vae, settings | {"scaling_factor": 0})
-    assert "its config.json: scaling_factor is 0, not above 0" in refused(capsys, "cogvideox", path, tmp_path / "o")
-    wrong: tuple[tuple[str, Any, str], ...] = (
-        ("norm_num_groups", "32", 'norm_num_groups is "32", not a whole number'),
-        ("scaling_factor", True, "scaling_factor is true, not a number"),
-    )
-    for name, value, message in wrong:
-        path = written(tmp_path / name, vae, settings | {name: value})
-        assert message in refused(capsys, "cogvideox", path, tmp_path / "o")
+    net = transformer(NET)
     own = cogvideox.transformer_settings(NET)
-    wrong = (
-        ("use_rotary_positional_embeddings", "false", 'positional_embeddings is "false", not true or false'),
-        ("max_text_seq_length", -1, "max_text_seq_length is -1, not above 0"),
+    newer = net | {"patch_embed.proj.weight": np.zeros((32, 96), np.float32)}
+    misfit = vae | {"extra": np.zeros(1, np.float32)}
+    del misfit["encoder.conv_out.conv.bias"]
+    wrong: tuple[tuple[Tensors, dict[str, Any] | None, str], ...] = (
+        (GENIE, None, "holds no network of CogVideoX, such as"),
+        (newer, None, "has 2 axes, as in CogVideoX 1.5; pass 1.0's"),
+        (vae, own, "is no CogVideoXTransformer3DModel"),
+        (vae, {"_class_name": "AutoencoderKL"}, "describes AutoencoderKL, not"),
+        (vae, settings | {"scaling_factor": 0}, "its config.json: scaling_factor is 0, not above 0"),
+        (vae, settings | {"scaling_factor": True}, "scaling_factor is true, not a number"),
+        (vae, settings | {"norm_num_groups": "32"}, 'norm_num_groups is "32", not a whole number'),
+        (net, own | {"use_rotary_positional_embeddings": "false"}, 'embeddings is "false", not true or false'),
+        (net, own | {"max_text_seq_length": -1}, "max_text_seq_length is -1, not above 0"),
+        (misfit, settings, "missing: encoder.conv_out.conv.bias; unexpected: extra"),
     )
-    for name, value, message in wrong:
-        path = written(tmp_path / name, transformer(NET), own | {name: value})
+    for number, (tensors, beside, message) in enumerate(wrong):
+        path = written(tmp_path / str(number), tensors, beside)
         assert message in refused(capsys, "cogvideox", path, tmp_path / "o")
-    del vae["encoder.conv_out.conv.bias"]
-    path = written(tmp_path / "lacks", vae | {"extra": np.zeros(1, np.float32)}, settings)
-    message = refused(capsys, "cogvideox", path, tmp_path / "o")
-    assert "missing: encoder.conv_out.conv.bias; unexpected: extra" in message
     wide = replace(NET, autoencoder=replace(VAE, latent_channels=4))
     convert("cogvideox", written(tmp_path / "wide", transformer(wide), None), tmp_path / "o")
-    path = written(tmp_path / "vae", autoencoder()[0], settings)
+    path = written(tmp_path / "vae", vae, settings)
     assert "holds a part with 4 latent channels, this one has 3" in refused(capsys, "cogvideox", path, tmp_path / "o")
 
 

@@ -45,29 +45,31 @@ def assert_same(path: Path, expected: Tensors) -> None:
         assert tensors[name].tobytes() == x.tobytes(), name
 
 
-@pytest.mark.parametrize("kind", ["tokenizer", "genie"])
-def test_import_and_export_are_inverse_to_the_bit(kind: str, tmp_path: Path) -> None:
-    kinds: dict[str, tuple[Tensors, Any]] = {
-        "tokenizer": (TOKENIZER, load_tokenizer),
-        "genie": (GENIE, load_world_model),
-    }
-    tensors, load = kinds[kind]
-    write_safetensors(tmp_path / "in.safetensors", tensors, {})
-    convert(kind, tmp_path / "in.safetensors", tmp_path / "own", *(["--heads", 2] if kind == "genie" else []))
-    convert(kind, "--export", tmp_path / "own", tmp_path / "out" / "x.safetensors")
-    assert_same(tmp_path / "out" / "x.safetensors", tensors)
-    convert(kind, tmp_path / "out" / "x.safetensors", tmp_path / "again")
-    (config, params), (config_again, params_again) = (load(tmp_path / d) for d in ("own", "again"))
-    assert config == config_again
-    jax.tree.map(np.testing.assert_array_equal, params, params_again)
-
-
-def test_one_directory_holds_a_tokenizer_and_a_model(tmp_path: Path) -> None:
-    for kind, tensors in (("tokenizer", TOKENIZER), ("genie", GENIE)):
-        write_safetensors(tmp_path / f"{kind}.safetensors", tensors, {})
-        convert(kind, tmp_path / f"{kind}.safetensors", tmp_path / "both", *(["--heads", 2] if kind == "genie" else []))
-    assert load_tokenizer(tmp_path / "both")[0].adaptive_norm
-    assert load_world_model(tmp_path / "both")[0].heads == 2
+def test_both_networks_come_back_to_the_bit_through_one_directory(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rest = {"loss.discriminator.main.0.bias": np.zeros(64, np.float32)}
+    load: dict[str, Any] = {"tokenizer": load_tokenizer, "genie": load_world_model}
+    for kind, tensors, beside, options, aside in (
+        ("tokenizer", TOKENIZER, rest, [], "1 tensor of loss.discriminator"),
+        ("genie", GENIE, {}, ["--heads", 2], "no tensors"),
+    ):
+        source = _written(tmp_path / f"{kind}.safetensors", tensors | beside)
+        out = tmp_path / kind / "x.safetensors"
+        for replaces in (False, True):
+            convert(kind, source, tmp_path / "own", *options)
+            made, left, *_ = capsys.readouterr().out.splitlines()
+            assert f"{len(tensors)} " in made
+            assert left == f"left aside: {aside}"
+            convert(kind, "--export", tmp_path / "own", out)
+            for said in (made, capsys.readouterr().out):
+                assert ("it replaces the one that was there" in said) == replaces
+        assert_same(out, tensors)
+    for kind in load:
+        convert(kind, tmp_path / kind / "x.safetensors", tmp_path / "again")
+        (config, params), (config_again, params_again) = (load[kind](tmp_path / name) for name in ("own", "again"))
+        assert config == config_again
+        jax.tree.map(np.testing.assert_array_equal, params, params_again)
 
 
 def test_an_exported_tokenizer_carries_its_configuration(tmp_path: Path) -> None:
@@ -81,19 +83,6 @@ def test_an_exported_tokenizer_carries_its_configuration(tmp_path: Path) -> None
     assert load_tokenizer(tmp_path / "again")[0] == other
 
 
-def test_the_command_prints_its_output_and_what_it_left_aside(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    rest = {"loss.discriminator.main.0.bias": np.zeros(64, np.float32)}
-    write_safetensors(tmp_path / "in.safetensors", TOKENIZER | rest, {})
-    convert("tokenizer", tmp_path / "in.safetensors", tmp_path / "own")
-    made, aside = capsys.readouterr().out.splitlines()
-    assert f"{len(TOKENIZER)} raw tensors" in made
-    assert aside == "left aside: 1 tensor of loss.discriminator"
-    convert("genie", _written(tmp_path / "genie.safetensors", GENIE), tmp_path / "own", "--heads", 2)
-    assert capsys.readouterr().out.splitlines()[1] == "left aside: no tensors"
-
-
 @pytest.mark.parametrize(
     ("settings", "expected"), [(None, True), ({"num_heads": 2}, True), ({"num_heads": 2, "use_mup": False}, False)]
 )
@@ -105,15 +94,6 @@ def test_the_command_says_when_it_assumes_no_mup(
         (tmp_path / "config.json").write_text(json.dumps(settings))
     convert("genie", tmp_path / "in.safetensors", tmp_path / "own", "--heads", 2)
     assert ("no use_mup in a config.json beside in.safetensors" in capsys.readouterr().out) == expected
-
-
-def test_replacing_an_output_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write_safetensors(tmp_path / "in.safetensors", GENIE, {})
-    for expected in (False, True):
-        convert("genie", tmp_path / "in.safetensors", tmp_path / "own", "--heads", 2)
-        convert("genie", "--export", tmp_path / "own", tmp_path / "out" / "x.safetensors")
-        convert("tokenizer", _written(tmp_path / "t.safetensors", TOKENIZER), tmp_path / "own")
-        assert capsys.readouterr().out.count("it replaces the one that was there") == 3 * expected
 
 
 def test_an_export_that_stops_leaves_no_settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -31,20 +31,6 @@ def random_params(network: Tokenizer | Transformer) -> Any:
     return jax.tree.map(lambda x: rng.normal(scale=0.4, size=x.shape).astype(np.float32), shapes)
 
 
-def test_networks_come_back_as_they_were_saved(tmp_path: Path) -> None:
-    """Both in one directory, whichever is written first."""
-    model = random_params(Transformer(MODEL))
-    tokenizer = random_params(Tokenizer(TOKENIZER))
-    save(tmp_path, MODEL, model)
-    save(tmp_path, TOKENIZER, tokenizer)
-    for (config, params), expected in (
-        (load_world_model(tmp_path), (MODEL, model)),
-        (load_tokenizer(tmp_path), (TOKENIZER, tokenizer)),
-    ):
-        assert config == expected[0]
-        jax.tree.map(np.testing.assert_array_equal, params, expected[1])
-
-
 def test_a_run_directory_is_never_written_to(tmp_path: Path) -> None:
     (tmp_path / "config.json").write_text(json.dumps(to_dict(presets.debug())))
     with pytest.raises(ConvertError, match="is a run directory; choose another one"):
@@ -66,9 +52,7 @@ def test_what_is_missing_or_damaged_is_named(load: Callable[[Path], Any], tmp_pa
             load(tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"), [([], "fields by name"), ("x", "fields by name"), ({"odd": 3}, "no field odd")]
-)
+@pytest.mark.parametrize(("settings", "message"), [([], "fields by name"), ({"odd": 3}, "no field odd")])
 def test_damaged_settings_are_refused_beside_sound_weights(settings: Any, message: str, tmp_path: Path) -> None:
     save(tmp_path, TOKENIZER, random_params(Tokenizer(TOKENIZER)))
     (tmp_path / "config.json").write_text(json.dumps({"tokenizer": settings, "architecture": settings}))

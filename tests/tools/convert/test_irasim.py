@@ -39,35 +39,27 @@ def vae(tmp_path: Path) -> Path:
     return path
 
 
-def test_irasim_comes_back_to_the_bit(weights: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folder = weights.parent
-    convert("irasim", weights, folder / "own", "--heads", NET.heads)
+def test_both_networks_come_back_through_one_directory(
+    weights: Path, vae: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    own = tmp_path / "own"
+    convert("irasim", weights, own, "--heads", NET.heads)
     assert "left aside: 2 tensors of fixed positions" in capsys.readouterr().out
-    convert("irasim", "--export", folder / "own", folder / "out.safetensors")
-    expected = public.random_weights(NET)
-    assert_same(folder / "out.safetensors", expected)
-    convert("irasim", folder / "out.safetensors", folder / "again")
-    assert load_irasim(folder / "again")[0] == load_irasim(folder / "own")[0]
-
-
-def test_sdxl_comes_back_to_the_bit_with_its_factor(vae: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    convert("sdxl", vae, vae.parent / "own")
+    convert("sdxl", vae, own)
     printed = capsys.readouterr().out
-    assert (
-        "left aside: no tensors" in printed
-        and "have the factor 0.2; the public IRASim needs SDXL's, 0.13025" in printed
-    )
-    config, params = load_kl_autoencoder(vae.parent / "own")
+    assert "left aside: no tensors" in printed
+    assert "have the factor 0.2; the public IRASim needs SDXL's, 0.13025" in printed
+    convert("irasim", "--export", own, tmp_path / "out.safetensors")
+    assert_same(tmp_path / "out.safetensors", public.random_weights(NET))
+    convert("irasim", tmp_path / "out.safetensors", tmp_path / "again")
+    assert load_irasim(tmp_path / "again")[0] == load_irasim(own)[0]
+    config, params = load_kl_autoencoder(own)
     assert config == SMALL
     np.testing.assert_allclose(np.exp(-params["latents"]["log_deviation"]), 0.2, rtol=1e-5)
-    (vae.parent / "out").mkdir()
-    convert("sdxl", "--export", vae.parent / "own", vae.parent / "out" / "x.safetensors")
-    assert json.loads((vae.parent / "out" / "config.json").read_text())["scaling_factor"] == 0.2
-
-
-def test_sdxl_has_the_names_of_diffusers(vae: Path) -> None:
-    names = set(read_tensors(vae).tensors)
-    assert names >= {
+    convert("sdxl", "--export", own, tmp_path / "out" / "x.safetensors")
+    assert json.loads((tmp_path / "out" / "config.json").read_text())["scaling_factor"] == 0.2
+    names = set(read_tensors(tmp_path / "out" / "x.safetensors").tensors)
+    assert names >= {  # as diffusers has them
         "quant_conv.weight",
         "encoder.down_blocks.0.resnets.0.conv1.weight",
         "encoder.down_blocks.0.downsamplers.0.conv.weight",
@@ -77,13 +69,6 @@ def test_sdxl_has_the_names_of_diffusers(vae: Path) -> None:
         "decoder.up_blocks.0.upsamplers.0.conv.bias",
         "decoder.conv_norm_out.weight",
     }
-
-
-def test_one_directory_holds_both_networks(weights: Path, vae: Path) -> None:
-    convert("irasim", weights, weights.parent / "own", "--heads", NET.heads)
-    convert("sdxl", vae, weights.parent / "own")
-    assert load_kl_autoencoder(weights.parent / "own")[0] == SMALL
-    assert load_irasim(weights.parent / "own")[0].width == NET.width
 
 
 def test_files_of_something_else_are_refused(

@@ -48,11 +48,10 @@ def files(tmp_path: Path) -> dict[str, Path]:
     return paths
 
 
-@pytest.mark.parametrize("order", [("tokenizer", "world_model"), ("world_model", "tokenizer")])
 def test_one_directory_holds_both_parts_and_exports_each_to_the_bit(
-    order: tuple[str, str], files: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    files: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for part in order:
+    for part in ("world_model", "tokenizer"):  # and below the other way round
         convert("ivideogpt", files[part], tmp_path / "own")
     said = capsys.readouterr().out
     assert f"a tokenizer of {len(TOKENIZER)} tensors" in said
@@ -72,7 +71,7 @@ def test_one_directory_holds_both_parts_and_exports_each_to_the_bit(
 
 
 def test_weights_without_actions_start_a_model_with_actions_that_changes_nothing(tmp_path: Path) -> None:
-    alone = IVideoGPTConfig(autoencoder=VQ, width=64, blocks=2, heads=1, mlp_width=32, use_actions=False)
+    alone = replace(LLAMA, use_actions=False)
     tensors = llama_tensors(alone)
     assert "model.norm.weight" in tensors
     write_safetensors(tmp_path / "in.safetensors", tensors, {})

@@ -1,7 +1,8 @@
 """A store exported as a LeRobotDataset, read back by our own reader of that format and by pandas."""
 
 import json
-from dataclasses import replace
+import shutil
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,8 @@ from rsjax.tools.ingest.windows import WindowConfig
 from tests.tools.ingest.formats.reading import read_all
 
 TASKS = ("pick", "place the lid", "pick")
+SUCCESS = np.array([False, False, True, False, True, True])
+VERSIONS = ("v3.0", "v2.1")
 
 
 def toy_store(path: Path, count: int = 5, frames: int = 6, size: int = 32, width: int = 3, **fields: Any) -> Store:
@@ -56,9 +59,37 @@ def assert_near(one: np.ndarray, other: np.ndarray) -> None:
     assert np.abs(one.astype(int) - other).mean() < 3
 
 
-@settings(max_examples=6)
+@dataclass(frozen=True)
+class Export:
+    """An export of all clips of a store, which a model has generated and whose success is known."""
+
+    clips: list[Any]
+    folder: Path
+    info: dict[str, Any]
+
+
+@pytest.fixture(scope="module")
+def exports(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Export]:
+    """An export in each version, with the default codec in one."""
+    folder = tmp_path_factory.mktemp("exports")
+    store = toy_store(folder / "store", success=SUCCESS, provenance={"source": GENERATED})
+    clips = records(store) + records(store, "test")
+    made: dict[str, Export] = {}
+    for options in (LeRobotOptions("v3.0", "all", crf=1), LeRobotOptions("v2.1", "all", codec="h264", crf=1)):
+        out = folder / options.version
+        made[options.version] = Export(clips, out, export_lerobot(store, out, options))
+    return made
+
+
+def ingest_options(out: Path, windows: WindowConfig, **changes: Any) -> IngestOptions:
+    """Options of an ingest that estimates nothing and finds no cuts."""
+    off = dict.fromkeys(("shots", "motion", "depth", "tracks", "semantics"), "none")
+    return IngestOptions(out=out, windows=windows, image_size=32, **{"test_share": 0.0, **off, **changes})
+
+
+@settings(max_examples=5)
 @given(
-    st.sampled_from(["v3.0", "v2.1"]),
+    st.sampled_from(VERSIONS),
     st.integers(2, 4),
     st.integers(2, 7),
     st.sampled_from([16, 18, 48]),
@@ -84,50 +115,106 @@ def test_what_is_exported_is_read_back(
         assert (episode.states is None) == (state == "none")
 
 
-def test_episodes_that_a_model_generated_are_listed(tmp_path: Path) -> None:
-    export_lerobot(toy_store(tmp_path / "real"), tmp_path / "one", LeRobotOptions(crf=1))
-    assert not (tmp_path / "one" / "meta" / PROVENANCE).exists()
-    made = toy_store(tmp_path / "generated", provenance={"source": GENERATED})
-    info = export_lerobot(made, tmp_path / "other", LeRobotOptions(crf=1))
-    mark = json.loads((tmp_path / "other" / "meta" / PROVENANCE).read_text())
-    assert mark["generated_episodes"] == list(range(info["total_episodes"])) and mark["note"] == GENERATED_MARK
-
-
-@pytest.mark.parametrize("version", ["v3.0", "v2.1"])
-def test_ingested_again_the_clips_are_the_same(tmp_path: Path, version: Any) -> None:
-    success = np.array([False, False, True, False, True, True])
-    store = toy_store(tmp_path / "store", success=success, provenance={"source": GENERATED})
-    info = export_lerobot(store, tmp_path / "out", LeRobotOptions(version, crf=1))
-    assert {name: info["features"][name]["dtype"] for name in OUTCOME} == OUTCOME
-    off = dict.fromkeys(("shots", "motion", "depth", "tracks", "semantics"), "none")
-    windows = WindowConfig(frames=6, rate=0, hop=6)
-    options = IngestOptions(out=tmp_path / "again", windows=windows, image_size=32, test_share=0.0, **off)  # type: ignore[arg-type]
-    ingest(make_plan("lerobot", tmp_path / "out", options))
+@pytest.mark.parametrize("version", VERSIONS)
+def test_ingested_again_the_clips_are_the_same(exports: dict[str, Export], tmp_path: Path, version: Any) -> None:
+    made = exports[version]
+    options = ingest_options(tmp_path / "again", WindowConfig(frames=6, rate=0, hop=6))
+    ingest(make_plan("lerobot", made.folder, options))
     again = rsjax.open_store(tmp_path / "again")
-    for old, new in zip(records(store), records(again), strict=True):
+    for old, new in zip(made.clips, records(again), strict=True):
         np.testing.assert_array_equal(new["actions"], old["actions"])
         np.testing.assert_array_equal(new["success"], old["success"])
         assert_near(new["rgb"], old["rgb"])
         assert new["task"] == old["task"]
         assert new["provenance"]["source"] == GENERATED
-        assert new["provenance"]["reward"] == success.astype(float).tolist()
+        assert new["provenance"]["reward"] == SUCCESS.astype(float).tolist()
     export_lerobot(again, tmp_path / "once more", LeRobotOptions(version, codec="h264"))
-    marks = [json.loads((tmp_path / name / "meta" / PROVENANCE).read_text()) for name in ("out", "once more")]
+    marks = [json.loads((folder / "meta" / PROVENANCE).read_text()) for folder in (made.folder, tmp_path / "once more")]
     assert marks[0] == marks[1]
+    assert marks[0]["generated_episodes"] == list(range(made.info["total_episodes"]))
+    assert marks[0]["note"] == GENERATED_MARK
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_rows_have_the_types_that_lerobot_casts_to_and_say_what_their_action_led_to(
+    exports: dict[str, Export], version: str
+) -> None:
+    """Lists of the feature's length, and scalars where its shape is [1]."""
+    features = exports[version].info["features"]
+    table = pq.read_table(next(exports[version].folder.glob("data/*/*.parquet")))
+    for name in table.schema.names:
+        shape = features[name]["shape"]
+        kind = table.schema.field(name).type
+        assert pa.types.is_fixed_size_list(kind) == (shape != [1])
+        assert shape == [1] or shape == [kind.list_size]
+    assert features["action"]["shape"] == [3]
+    assert features["observation.state"]["shape"] == [2]
+    assert {str(table.schema.field(name).type) for name in ("frame_index", "index", "task_index")} == {"int64"}
+    assert {name: features[name]["dtype"] for name in OUTCOME} == OUTCOME
+    rows = {name: table[name].to_pylist()[:6] for name in OUTCOME}
+    assert rows["next.success"] == [False, True, False, True, True, True]
+    assert rows["next.reward"] == [0.0, 1.0, 0.0, 1.0, 1.0, 1.0]
+    assert rows["next.done"] == [False] * 5 + [True]
+
+
+def test_statistics_are_those_of_all_rows(exports: dict[str, Export]) -> None:
+    made = exports["v3.0"]
+    actions = np.concatenate([np.concatenate([clip["actions"][1:], clip["actions"][-1:]]) for clip in made.clips])
+    pixels = np.concatenate([clip["rgb"].reshape(-1, 3) for clip in made.clips]) / 255
+    stats = json.loads((made.folder / "meta/stats.json").read_text())
+    for rows, own in ((actions, stats["action"]), (pixels, stats["observation.images.image"])):
+        for name in ("min", "max", "mean", "std"):
+            np.testing.assert_allclose(np.ravel(own[name]), getattr(rows, name)(0), rtol=1e-5, atol=1e-6)
+        assert own["count"] == [len(actions)]
+        rising = [np.ravel(own[name]) for name in ("min", "q01", "q10", "q50", "q90", "q99", "max")]
+        assert (np.diff(rising, axis=0) >= 0).all()
+    assert np.shape(stats["observation.images.image"]["mean"]) == (3, 1, 1)
+    assert made.info["splits"] == {"train": "0:4", "test": "4:5"} and made.info["total_frames"] == 30
+    assert set(stats) == set(made.info["features"])
+
+
+def test_v21_has_a_line_for_each_episode(exports: dict[str, Export]) -> None:
+    made = exports["v2.1"]
+    lines = {
+        name: [json.loads(line) for line in (made.folder / f"meta/{name}.jsonl").read_text().splitlines()]
+        for name in ("tasks", "episodes", "episodes_stats")
+    }
+    assert [row["length"] for row in lines["episodes"]] == [6] * 5
+    assert [row["task_index"] for row in lines["tasks"]] == list(range(made.info["total_tasks"]))
+    assert all(set(row["stats"]) == set(made.info["features"]) for row in lines["episodes_stats"])
+    for each in lines["episodes_stats"][0]["stats"].values():
+        assert set(each) == {"min", "max", "mean", "std", "count"}
+    assert (made.info["total_videos"], made.info["total_chunks"]) == (5, 1)
+
+
+def test_pandas_finds_the_tasks_by_their_text(exports: dict[str, Export]) -> None:
+    pandas = pytest.importorskip("pandas", reason="pandas is in requirements-extras.txt (make extras)")
+    frame = pandas.read_parquet(exports["v3.0"].folder / "meta/tasks.parquet")
+    for number, task in enumerate(frame.index):
+        assert frame.loc[task].task_index == number and task in TASKS
+
+
+def test_a_damaged_list_of_generated_episodes_is_named(exports: dict[str, Export], tmp_path: Path) -> None:
+    shutil.copytree(exports["v2.1"].folder, tmp_path / "out")
+    path = tmp_path / "out" / "meta" / PROVENANCE
+    for text in ("", "[]", "{}", '{"generated_episodes": ["x"]}', '{"generated_episodes": 3}'):
+        path.write_text(text)
+        with pytest.raises(UserError) as caught:
+            open_source("lerobot", tmp_path / "out")
+        assert str(path) in str(caught.value)
 
 
 def test_what_actions_are_and_which_clips_are_of_one_recording_is_kept(tmp_path: Path) -> None:
-    off = dict.fromkeys(("shots", "motion", "depth", "tracks", "semantics"), "none")
     windows = WindowConfig(frames=3, rate=0, hop=1)
-    first = IngestOptions(out=tmp_path / "clips", windows=windows, image_size=32, test_share=0.0, **off)  # type: ignore[arg-type]
-    export_lerobot(toy_store(tmp_path / "store", 8), tmp_path / "recorded", LeRobotOptions(crf=1))
+    first = ingest_options(tmp_path / "clips", windows)
+    export_lerobot(toy_store(tmp_path / "store", 8), tmp_path / "recorded", LeRobotOptions(codec="h264", crf=1))
     (tmp_path / "recorded" / "meta" / "rsjax.json").unlink()  # somebody else's recordings, of deltas
     declared = replace(first, option=("kind=delta", "held=[2]"))
     ingest(make_plan("lerobot", tmp_path / "recorded", declared))
     store = rsjax.open_store(tmp_path / "clips")
     assert store.manifest["action_dimensions"] == ["action_0 (delta)", "action_1 (delta)", "action_2 (held)"]
 
-    export_lerobot(store, tmp_path / "out", LeRobotOptions(crf=1))
+    export_lerobot(store, tmp_path / "out", LeRobotOptions(codec="h264"))
     options = replace(first, out=tmp_path / "again", windows=replace(windows, hop=3), test_share=0.3)
     ingest(make_plan("lerobot", tmp_path / "out", options))
     again = rsjax.open_store(tmp_path / "again")
@@ -141,32 +228,7 @@ def test_what_actions_are_and_which_clips_are_of_one_recording_is_kept(tmp_path:
     assert set(split_of.values()) == {"train", "test"}
 
 
-@pytest.mark.parametrize("version", ["v3.0", "v2.1"])
-def test_rows_say_what_their_action_led_to_where_the_store_knows(tmp_path: Path, version: Any) -> None:
-    success = np.array([False, True, False, False, False, True])
-    export_lerobot(toy_store(tmp_path / "store", 2, success=success), tmp_path / "out", LeRobotOptions(version, crf=1))
-    table = pq.read_table(next((tmp_path / "out").glob("data/*/*.parquet")), columns=list(OUTCOME))
-    rows = {name: table[name].to_pylist()[:6] for name in OUTCOME}
-    assert rows["next.success"] == [True, False, False, False, True, True]
-    assert rows["next.reward"] == [1.0, 0.0, 0.0, 0.0, 1.0, 1.0]
-    assert rows["next.done"] == [False] * 5 + [True]
-    info = export_lerobot(toy_store(tmp_path / "unknown", 2), tmp_path / "other", LeRobotOptions(version, crf=1))
-    assert not info["features"].keys() & OUTCOME.keys()
-
-
-def test_a_damaged_list_of_generated_episodes_is_named(tmp_path: Path) -> None:
-    made = toy_store(tmp_path / "generated", 2, provenance={"source": GENERATED})
-    export_lerobot(made, tmp_path / "out", LeRobotOptions(crf=1))
-    path = tmp_path / "out" / "meta" / PROVENANCE
-    for text in ("", "[]", "{}", '{"generated_episodes": ["x"]}', '{"generated_episodes": 3}'):
-        path.write_text(text)
-        with pytest.raises(UserError) as caught:
-            open_source("lerobot", tmp_path / "out")
-        assert str(path) in str(caught.value)
-
-
-@pytest.mark.parametrize("version", ["v3.0", "v2.1"])
-def test_a_clip_of_an_export_is_one_shot_however_it_changes(tmp_path: Path, version: Any) -> None:
+def test_a_clip_of_an_export_is_one_shot_however_it_changes(tmp_path: Path) -> None:
     def clips() -> Any:
         for number in range(3):
             rgb = np.full((20, 32, 32, 3), 20, np.uint8)
@@ -176,10 +238,9 @@ def test_a_clip_of_an_export_is_one_shot_however_it_changes(tmp_path: Path, vers
             yield {"rgb": rgb, "actions": actions, "task": "pick", "fps": 5.0}
 
     store = rsjax.write_store(tmp_path / "store", clips(), test_share=0.0)
-    export_lerobot(store, tmp_path / "out", LeRobotOptions(version, crf=1))
-    off = dict.fromkeys(("motion", "depth", "tracks", "semantics"), "none")
+    export_lerobot(store, tmp_path / "out", LeRobotOptions(codec="h264", crf=1))
     windows = WindowConfig(frames=20, rate=0, hop=20)
-    own = IngestOptions(out=tmp_path / "own", windows=windows, image_size=32, test_share=0.0, **off)  # type: ignore[arg-type]
+    own = ingest_options(tmp_path / "own", windows, shots=IngestOptions.shots)
     ingest(make_plan("lerobot", tmp_path / "out", replace(own, camera="observation.images.image")))
     assert sum(rsjax.open_store(tmp_path / "own").counts().values()) == 3
     (tmp_path / "out" / "meta" / "rsjax.json").unlink()  # another program's: the cut counts
@@ -198,14 +259,15 @@ def test_openpis_horizon_is_measured_by_the_actions_that_there_are() -> None:
 
 
 def test_large_data_sets_fill_several_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    store = toy_store(tmp_path / "store", 5)
+    store = toy_store(tmp_path / "store", 5, width=1)
     for name in ("DATA_MEGABYTES", "VIDEO_MEGABYTES"):
         monkeypatch.setattr(lerobot_files, name, 0)
     for name, value in (("CHUNK", 2), ("BUFFERED", 2)):
         monkeypatch.setattr(lerobot_files, name, value)
     export_lerobot(store, tmp_path / "out", LeRobotOptions(codec="h264"))
     assert len(list((tmp_path / "out").glob("data/chunk-*/*"))) == 4
-    assert (tmp_path / "out/data/chunk-001/file-001.parquet").exists()
+    schema = pq.read_schema(tmp_path / "out/data/chunk-001/file-001.parquet")
+    assert not pa.types.is_fixed_size_list(schema.field("action").type), "a single number is a scalar"
     for clip, episode in zip(records(store), read_all("lerobot", tmp_path / "out"), strict=True):
         np.testing.assert_array_equal(episode.actions, clip["actions"])
         assert_near(episode.cameras["image"].read(range(6)), clip["rgb"])
@@ -224,70 +286,10 @@ def test_clips_of_several_cameras_are_named_after_the_first(tmp_path: Path, caps
     merge([store.path for store in stores], tmp_path / "both")
     info = export_lerobot(rsjax.open_store(tmp_path / "both"), tmp_path / "out", LeRobotOptions(codec="h264"))
     assert "observation.images.front" in info["features"]
+    assert not (tmp_path / "out" / "meta" / PROVENANCE).exists()
+    assert not info["features"].keys() & OUTCOME.keys()
     said = " ".join("".join(capsys.readouterr()).split())
     assert "clips of the cameras front, wrist; all are in observation.images.front" in said
-
-
-def test_statistics_are_those_of_all_rows(tmp_path: Path) -> None:
-    store = toy_store(tmp_path / "store")
-    info = export_lerobot(store, tmp_path / "out", LeRobotOptions(codec="h264", split="all"))
-    clips = records(store, "train") + records(store, "test")
-    actions = np.concatenate([np.concatenate([clip["actions"][1:], clip["actions"][-1:]]) for clip in clips])
-    pixels = np.concatenate([clip["rgb"].reshape(-1, 3) for clip in clips]) / 255
-    stats = json.loads((tmp_path / "out/meta/stats.json").read_text())
-    for rows, own, count in (
-        (actions, stats["action"], len(actions)),
-        (pixels, stats["observation.images.image"], len(actions)),
-    ):
-        for name in ("min", "max", "mean", "std"):
-            np.testing.assert_allclose(np.ravel(own[name]), getattr(rows, name)(0), rtol=1e-5, atol=1e-6)
-        assert own["count"] == [count]
-        assert (
-            np.diff([np.ravel(own[name]) for name in ("min", "q01", "q10", "q50", "q90", "q99", "max")], axis=0) >= 0
-        ).all()
-    assert np.shape(stats["observation.images.image"]["mean"]) == (3, 1, 1)
-    assert info["splits"] == {"train": "0:4", "test": "4:5"} and info["total_frames"] == 30
-    assert set(stats) == set(info["features"])
-
-
-def test_v21_has_a_line_for_each_episode(tmp_path: Path) -> None:
-    info = export_lerobot(toy_store(tmp_path / "store"), tmp_path / "out", LeRobotOptions("v2.1", codec="h264"))
-    lines = {
-        name: [json.loads(line) for line in (tmp_path / f"out/meta/{name}.jsonl").read_text().splitlines()]
-        for name in ("tasks", "episodes", "episodes_stats")
-    }
-    assert [row["length"] for row in lines["episodes"]] == [6] * 4
-    assert [row["task_index"] for row in lines["tasks"]] == list(range(info["total_tasks"]))
-    assert all(set(row["stats"]) == set(info["features"]) for row in lines["episodes_stats"])
-    assert all(
-        set(each) == {"min", "max", "mean", "std", "count"} for each in lines["episodes_stats"][0]["stats"].values()
-    )
-    assert (info["total_videos"], info["total_chunks"]) == (4, 1)
-
-
-def test_pandas_finds_the_tasks_by_their_text(tmp_path: Path) -> None:
-    pandas = pytest.importorskip("pandas", reason="pandas is in requirements-extras.txt (make extras)")
-    export_lerobot(toy_store(tmp_path / "store"), tmp_path / "out", LeRobotOptions(codec="h264"))
-    frame = pandas.read_parquet(tmp_path / "out/meta/tasks.parquet")
-    for number, task in enumerate(frame.index):
-        assert frame.loc[task].task_index == number and task in TASKS
-
-
-@pytest.mark.parametrize("version", ["v3.0", "v2.1"])
-@pytest.mark.parametrize("width", [1, 3])
-def test_columns_have_the_types_that_lerobot_casts_to(tmp_path: Path, version: Any, width: int) -> None:
-    """Lists of the feature's length, and scalars where its shape is [1]."""
-    store = toy_store(tmp_path / "store", width=width)
-    info = export_lerobot(store, tmp_path / "out", LeRobotOptions(version, codec="h264"))
-    schema = pq.read_schema(next((tmp_path / "out").glob("data/*/*.parquet")))
-    for name in schema.names:
-        shape = info["features"][name]["shape"]
-        kind = schema.field(name).type
-        assert pa.types.is_fixed_size_list(kind) == (shape != [1])
-        assert shape == [1] or shape == [kind.list_size]
-    assert info["features"]["action"]["shape"] == [width]
-    assert info["features"]["observation.state"]["shape"] == [2]
-    assert {str(schema.field(name).type) for name in ("frame_index", "index", "task_index")} == {"int64"}
 
 
 def test_an_export_is_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

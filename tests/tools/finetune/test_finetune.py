@@ -4,6 +4,7 @@ import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from unittest.mock import patch
 
 import jax
@@ -23,6 +24,7 @@ from rsjax.config import (
 from rsjax.data.store import Store, open_store
 from rsjax.errors import UserError
 from rsjax.files import write_json
+from rsjax.models.base import create_model
 from rsjax.models.load_run import load
 from rsjax.tools.commands import describe
 from rsjax.tools.convert import genie, tokenizer
@@ -41,7 +43,7 @@ from rsjax.tools.finetune.start import find_source
 from rsjax.tools.pipeline.run import Run
 from rsjax.tools.pipeline.stages import prepare as prepare_tokens
 from rsjax.tools.pipeline.stages import train_tokenizer, train_world_model
-from rsjax.training.checkpoint import save_weights
+from rsjax.training.checkpoint import load_weights, save_weights
 from tests.tools.convert.public import genie_shapes, random_tensors, tokenizer_shapes
 from tests.tools.pipeline import toy
 
@@ -99,9 +101,17 @@ def test_the_run_starts_from_the_model_and_is_like_any_other(whole: Run, model: 
     _, own = load_world_model(model)
     assert own.keys() - start.keys() == {"action_encoder"}
     jax.tree.map(np.testing.assert_array_equal, start, {name: own[name] for name in start})
+    changes = jax.tree.map(lambda x, y: np.abs(x - y).max(), start, {name: trained.params[name] for name in start})
+    assert 0 < max(jax.tree.leaves(changes)) < 0.1
 
 
-def test_a_prepared_run_can_be_described(whole: Run, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_prepared_run_says_what_its_clips_lack_and_can_be_described(
+    whole: Run, model: Path, data: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    finetune(find_source(model), Recordings("npz", data), CUTTING, SETTINGS, whole.directory, only_cost=True)
+    said = capsys.readouterr().out
+    assert "actions are not combined" in said and "--option kind=absolute" in said
+    assert "no clip has depth: the depth loss is masked" in said and "--depth video-depth-anything:" in said
     with patch.object(sys, "argv", ["rsjax describe", str(whole.directory)]):
         describe.main()
     assert f"rsjax compile {whole.directory} --target" in capsys.readouterr().out
@@ -117,39 +127,29 @@ def test_killed_and_started_again_it_has_the_same_weights(whole: Run) -> None:
     jax.tree.map(np.testing.assert_array_equal, before, load(whole.directory).params)
 
 
-def test_missing_depth_is_said_with_the_way_to_get_it(
-    whole: Run, model: Path, data: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    finetune(find_source(model), Recordings("npz", data), CUTTING, SETTINGS, whole.directory, only_cost=True)
-    said = capsys.readouterr().out
-    assert "actions are not combined" in said and "--option kind=absolute" in said
-    assert "no clip has depth: the depth loss is masked" in said and "--depth video-depth-anything:" in said
-
-
-def test_a_share_of_the_steps_trains_on_short_clips(whole: Run, model: Path) -> None:
-    halves = replace(SETTINGS, short_share=0.5)
-    short, long = finetuned(find_source(model), open_store(whole.clips), "", halves, adapts=True).train.curriculum
+def test_short_clips_and_an_early_stop_are_chosen_by_word(whole: Run, model: Path) -> None:
+    settings = replace(SETTINGS, short_share=0.5, patience=3)
+    train = finetuned(find_source(model), open_store(whole.clips), "", settings, adapts=True).train
+    assert train.early_stop == EarlyStopConfig(every=LEAST_BETWEEN, patience=3)
+    assert whole.config.tokenizer_train.early_stop is not None
+    short, long = train.curriculum
     assert (short.frames, long.frames) == (2, 0)
     assert short.epochs == long.epochs == SETTINGS.steps / 2 * toy.config().train.batch_size / 2
     assert len(whole.config.train.curriculum) == 1
 
 
-def test_another_model_or_setting_needs_another_directory(whole: Run, model: Path) -> None:
-    store = open_store(whole.clips)
-    with pytest.raises(UserError) as caught:
-        prepare(find_source(model), store, replace(SETTINGS, seed=1), whole.directory)
-    assert "choose another --out" in str(caught.value)
-
-
-def test_a_moved_model_is_the_same_and_other_weights_are_not(whole: Run, model: Path, tmp_path: Path) -> None:
+def test_a_moved_model_is_the_same_and_other_weights_or_settings_are_not(
+    whole: Run, model: Path, tmp_path: Path
+) -> None:
     moved = tmp_path / "moved"
     shutil.copytree(model, moved)
     assert prepare(find_source(moved), open_store(whole.clips), SETTINGS, whole.directory) == whole.config
     params = toy.world_model_params(toy.config())
     save_weights(moved / "world_model" / "weights", jax.tree.map(lambda x: x + 1, params))
-    with pytest.raises(UserError) as caught:
-        prepare(find_source(moved), open_store(whole.clips), SETTINGS, whole.directory)
-    assert "choose another --out" in str(caught.value)
+    for source, settings in ((moved, SETTINGS), (model, replace(SETTINGS, seed=1))):
+        with pytest.raises(UserError) as caught:
+            prepare(find_source(source), open_store(whole.clips), settings, whole.directory)
+        assert "choose another --out" in str(caught.value)
 
 
 def test_public_weights_are_taken_by_path(whole: Run, tmp_path: Path) -> None:
@@ -163,20 +163,17 @@ def test_public_weights_are_taken_by_path(whole: Run, tmp_path: Path) -> None:
     public = tmp_path / "public"
     tokenizer.convert(tmp_path / "magvit.safetensors", public, "raw")
     genie.convert(tmp_path / "genie" / "model.safetensors", public, None)
-    two_steps = replace(SETTINGS, steps=2, tokenizer="keep")
-    source = find_source(public)
-    small = replace(source.config, train=replace(source.config.train, batch_size=2))
-    config = prepare(replace(source, config=small), open_store(whole.clips), two_steps, tmp_path / "out")
+    keeping = replace(SETTINGS, tokenizer="keep")
+    config = prepare(find_source(public), open_store(whole.clips), keeping, tmp_path / "out")
     assert isinstance(config.model, GenieConfig)
     assert (config.model.width, config.clips.action_dim) == (16, 6)
-    run = Run(config, tmp_path / "out", Path("data"))
-    run.prepare(overwrite=False)
-    train_tokenizer(run, resume=True)
-    prepare_tokens(run)
-    train_world_model(run, resume=True)
-    embedding = load(run.directory).params["rgb_embed"]["factored_embed_0"]["embedding"]
-    change = np.abs(embedding - published["token_embed.factored_embeds.0.weight"])
-    assert 0 < change.max() < 0.1
+    start = Path(config.train.start_from)
+    assert start == (tmp_path / "out" / "start").absolute() == Path(config.tokenizer_train.start_from)
+    world_model: Any = create_model(config)
+    begun = load_weights(start / "world_model" / "weights", world_model.pretrained_shapes(start))
+    np.testing.assert_array_equal(
+        begun["rgb_embed"]["factored_embed_0"]["embedding"], published["token_embed.factored_embeds.0.weight"]
+    )
 
 
 def test_what_stands_still_is_kept_if_the_camera_does_not_move_or_by_word(whole: Run, model: Path) -> None:
@@ -245,12 +242,6 @@ def test_targets_are_not_added_up(whole: Run, model: Path) -> None:
         config = finetuned(source, known, "", SETTINGS.for_clips(source.config, 2), adapts=True)
         assert isinstance(config.model, RoboScapeConfig)
         assert config.model.departures.integrate_actions is added
-
-
-def test_the_best_weights_count_by_word(whole: Run, model: Path) -> None:
-    config = finetuned(find_source(model), open_store(whole.clips), "", replace(SETTINGS, patience=3), adapts=True)
-    assert config.train.early_stop == EarlyStopConfig(every=LEAST_BETWEEN, patience=3)
-    assert whole.config.tokenizer_train.early_stop is not None
 
 
 @pytest.mark.parametrize(("psnr", "kept"), [(30.0, True), (22.0, False), (14.9, False)])

@@ -7,12 +7,23 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from rsjax.config import ConfigError
-from rsjax.tools.ingest.actions import ActionConfig, ActionLayout, align_actions, continuous_signs, sampled_actions
+from rsjax.tools.ingest.actions import (
+    ActionConfig,
+    ActionLayout,
+    align_actions,
+    continuous_signs,
+    describe_dimensions,
+    described_layout,
+    flat_names,
+    layout_of,
+    sampled_actions,
+)
 from rsjax.tools.ingest.episode import EpisodeError
 
 FLOATS = st.floats(-10, 10, width=32)
 ROWS = hnp.arrays(np.float32, st.tuples(st.integers(2, 20), st.integers(1, 4)), elements=FLOATS)
 EVERY = ActionConfig()
+COUNT = 60
 
 
 def turn(axis: int, angle: float) -> np.ndarray:
@@ -149,3 +160,60 @@ def test_a_layout_survives_json() -> None:
         assert ActionLayout.from_json(json.loads(json.dumps(layout.to_json()))) == layout
         assert ("angles" in layout.to_json()) == bool(angles)
     assert ActionLayout.from_json({}) == ActionLayout()
+
+
+def doubts(values: np.ndarray, name: str = "x") -> tuple[str, ...]:
+    rows = np.concatenate([np.zeros(1), values])[:, None].astype(np.float32)
+    return layout_of(rows, "delta", None, names=[name]).unclear
+
+
+@pytest.mark.parametrize(
+    ("values", "name", "why"),
+    [
+        (np.arange(COUNT) > 30, "x", "is never anything but 0 or 1"),
+        (np.where(np.arange(COUNT) > 30, 1, -1), "x", "is never anything but -1 or 1"),
+        (np.ones(COUNT), "x", "is never anything but 1"),
+        (np.linspace(0, 0.08, COUNT), "Gripper_pos", "is a gripper"),
+        (np.linspace(-1.2, -0.8, COUNT), "joint", "never comes near zero (-1.2 to -0.8)"),
+    ],
+)
+def test_what_cannot_be_a_step_is_named(values: np.ndarray, name: str, why: str) -> None:
+    assert doubts(values, name) == (f"dimension 0 ({name}) {why}",)
+
+
+def test_targets_are_known_by_the_state() -> None:
+    steps = np.random.default_rng(0).normal(0, 0.01, (COUNT, 2)).astype(np.float32)
+    path = np.cumsum(steps, 0)  # passes zero
+    target = np.concatenate([path[1:], path[-1:]])
+    near = [doubt.endswith("is nearly the state") for doubt in layout_of(target, None, None, states=path).unclear]
+    assert near == [True, True]
+    assert layout_of(steps, None, None, states=path).unclear == ()
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(1e-3, 10), st.integers(8, 80))
+def test_steps_that_stop_now_and_then_pass(seed: int, size: float, count: int) -> None:
+    rng = np.random.default_rng(seed)
+    values = rng.normal(0, size, count)
+    values[rng.integers(1, count)] = 0
+    path = np.cumsum(values)[:, None]
+    assert doubts(values) == () and doubts(np.zeros(count)) == ()
+    assert layout_of(values[:, None], "delta", None, states=path + 9 * size * count).unclear == ()
+
+
+def test_names_of_dimensions() -> None:
+    assert flat_names({"motors": ["a", "b"]}, 2) == flat_names([["a", "b"]], 2) == ["a", "b"]
+    assert flat_names({"a": 0, "b": 1}, 2) == ["a", "b"]
+    assert flat_names(["a"], 2) == flat_names(None, 2) == flat_names({"motors": 3}, 2) == []
+
+
+def test_each_dimension_is_described() -> None:
+    layout = ActionLayout("absolute", (0,), (4,))
+    names = ["x", "y", "z", "w", "grip"]
+    assert describe_dimensions(layout, names, ActionConfig(), 5)[3:] == ["w (absolute, of a quaternion)", "grip (held)"]
+    assert describe_dimensions(layout, (), ActionConfig(kind="delta"), 5)[3:] == ["(delta, of a quaternion)", "(held)"]
+    stacked = describe_dimensions(ActionLayout("undeclared"), ["x"], ActionConfig(compose="stack"), 2)
+    assert stacked == ["x (undeclared, row 0)", "x (undeclared, row 1)"]
+    turns = ActionLayout("absolute", held=(2,), angles=(1,))
+    described = describe_dimensions(turns, ["x", "yaw", "grip"], ActionConfig(), 3)
+    assert described == ["x (absolute)", "yaw (absolute, an angle)", "grip (held)"]
+    assert described_layout(described) == turns

@@ -3,7 +3,6 @@
 import json
 import os
 import shutil
-import signal
 import subprocess
 import sys
 import time
@@ -17,9 +16,9 @@ import pytest
 from rsjax.data.store import open_store
 from rsjax.tools.commands import doctor, ingest, inspect, store
 from rsjax.tools.ingest.options import source_options
-from rsjax.tools.ingest.summary import QUARANTINE
 from tests.bridge import BRIDGE, needs_bridge
 from tests.data.clips import clip_store, numbers
+from tests.tools.ingest.formats.toy_tfrecord import bridge_episode, write_bridge
 
 
 class Command:
@@ -33,6 +32,12 @@ class Command:
         """What it prints."""
         self._monkeypatch.setattr(sys, "argv", [module.__name__, *map(str, arguments)])
         module.main()
+        return self._capsys.readouterr().out
+
+    def finding(self, module: ModuleType, *arguments: object) -> str:
+        """What a command prints that ends with status 1."""
+        with pytest.raises(SystemExit, match="1"):
+            self(module, *arguments)
         return self._capsys.readouterr().out
 
     def refused(self, module: ModuleType, *arguments: object) -> str:
@@ -87,8 +92,7 @@ SMALL = ["--windows.rate", 0, "--windows.frames", 4]
 
 def test_what_the_doctor_leaves_out_is_quarantined_with_its_reasons(command: Command, tmp_path: Path) -> None:
     source = folder_of_episodes(tmp_path / "source", 4, copies=(2,))
-    with pytest.raises(SystemExit, match="1"):
-        command(doctor, "folder", source, "--fix", tmp_path / "fixed.json")
+    command.finding(doctor, "folder", source, "--fix", tmp_path / "fixed.json")
     line = ["folder", source, "--out", tmp_path / "store", "--workers", 0, *SMALL]
     text = command(ingest, *line, "--selection", tmp_path / "fixed.json")
     assert "episodes  4 = 3 with clips + 0 without + 1 quarantined" in text
@@ -98,6 +102,28 @@ def test_what_the_doctor_leaves_out_is_quarantined_with_its_reasons(command: Com
     manifest = open_store(tmp_path / "store").manifest
     assert "left out by the list" in manifest["quarantine"]["episode_02"]
     assert "episodes  4 = 4 with clips" in command(ingest, *line)
+
+
+def test_the_doctors_status_and_its_list(command: Command, tmp_path: Path) -> None:
+    fix = tmp_path / "m.json"
+    line = ["rlds", tmp_path / "data"]
+    write_bridge(tmp_path / "data", [bridge_episode(5), bridge_episode(4, task=""), b"\xff"])
+    text = command.finding(doctor, *line, "--option", "split=train", "--fix", fix)
+    assert "train-00000-00001: no-task" in text and "train-00000-00002: unreadable" in text
+    assert "3 episodes: 1 without a finding, 2 with" in text
+    left_out = [entry["id"] for entry in json.loads(fix.read_text())["left_out"]]
+    assert left_out == ["train-00000-00001", "train-00000-00002"]
+
+    write_bridge(tmp_path / "data", [bridge_episode(4, task=""), bridge_episode(5, task="")])
+    text = command.finding(doctor, *line, "--fix", fix)
+    assert "all are 'no-task': if that is as it should be, --ignore no-task" in text
+    assert "keeps 0, leaves out 2; nothing is left to ingest: --ignore no-task, and write it again" in text
+    assert f"{fix}: keeps 2, leaves out 0\n" in command(doctor, *line, "--fix", fix, "--ignore", "no-task")
+
+    write_bridge(tmp_path / "data", [b"\xff", b"\xff\xff"])
+    text = command.finding(doctor, *line, "--fix", fix)
+    assert "unreadable" in text and "--ignore" not in text  # what makes everything unreadable is never to be ignored
+    assert "keeps 0, leaves out 2; nothing is left to ingest: mend what is wrong, and write it again" in text
 
 
 def test_the_papers_recipe_filters_windows_and_the_default_says_what_it_leaves_out(
@@ -128,23 +154,22 @@ def test_a_clip_keeps_the_original_name_of_its_episode(command: Command, tmp_pat
     assert provenance["episode"].isascii()
 
 
-@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 75)])
-def test_a_command_that_is_stopped_goes_on(command: Command, tmp_path: Path, number: int, status: int) -> None:
-    source = folder_of_episodes(tmp_path / "source", 40)
+def test_a_command_that_is_stopped_goes_on(command: Command, tmp_path: Path) -> None:
+    source = folder_of_episodes(tmp_path / "source", 24)
     line = ["folder", source, "--out", tmp_path / "store", *SMALL]
     words = [sys.executable, "-m", "experiments.ingest", *map(str, line), "--workers", "1"]
     with subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as process:
         while not list(tmp_path.glob("store.work/items/**/*.json")):
             assert process.poll() is None
             time.sleep(0.01)
-        process.send_signal(number)
+        process.terminate()
         _, text = process.communicate()
-    assert process.returncode == status and text.count("\n") == 1 and "the same command resumes" in text
+    assert process.returncode == 75 and text.count("\n") == 1 and "the same command resumes" in text
     marks = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("items/**/*.json")}
-    # All 200 are there if the machine was so busy that the signal came while the clips were packed.
-    assert 0 < len(marks) <= 200 and not (tmp_path / "store").exists()
+    # All 120 are there if the machine was so busy that the signal came while the clips were packed.
+    assert 0 < len(marks) <= 120 and not (tmp_path / "store").exists()
     text = command(ingest, *line, "--workers", 0, "--keep-clips")
-    assert f"this run  {200 - len(marks)} work items" in text
+    assert f"this run  {120 - len(marks)} work items" in text
     assert {path: path.stat().st_mtime_ns for path in marks} == marks
 
 
@@ -156,16 +181,6 @@ def test_the_help_says_what_source_and_path_are(command: Command, capsys: pytest
         "agibot, lerobot, robomimic, libero, rlds, bair, folder, npz, sim" in text
         and "PATH is the folder or file" in text
     )
-
-
-def test_recordings_that_are_too_short_are_reported_in_numbers_with_a_cure(command: Command, tmp_path: Path) -> None:
-    source = folder_of_episodes(tmp_path / "source", 2)
-    line = ["folder", source, "--out", tmp_path / "store", "--workers", 0, "--shots", "none"]
-    text = command.refused(ingest, *line)
-    assert "16 frames at 2 Hz take 76 of 10 fps; the longest has 12" in text
-    assert "raise --windows.rate or lower --windows.frames" in text and QUARANTINE not in text
-    cured = command(ingest, *line, "--windows.rate", 10, "--windows.frames", 12)
-    assert "2 = 2 with clips" in cured
 
 
 def test_undeclared_actions_stop_an_ingest_before_it_annotates_and_inspect_names_dimensions(
@@ -195,14 +210,14 @@ def test_a_store_is_split_and_merged(command: Command, tmp_path: Path) -> None:
     assert len(numbers(open_store(tmp_path / "halves" / "part-001"))) == 3
 
 
-@pytest.mark.parametrize("option", ["--rerun", "--rerun-file=a.rrd"])
 def test_without_the_viewer_both_of_its_options_are_named(
-    command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, option: str
+    command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
     clip_store(tmp_path / "a")
-    text = command.refused(inspect, tmp_path / "a", option)
-    assert "--rerun and --rerun-file need the viewer: pip install 'rsjax[rerun]'" in text
+    for option in ("--rerun", "--rerun-file=a.rrd"):
+        text = command.refused(inspect, tmp_path / "a", option)
+        assert "--rerun and --rerun-file need the viewer: pip install 'rsjax[rerun]'" in text
 
 
 def test_a_damaged_store_is_inspected_and_the_status_says_so(command: Command, tmp_path: Path) -> None:
@@ -211,8 +226,7 @@ def test_a_damaged_store_is_inspected_and_the_status_says_so(command: Command, t
     payload = np.fromfile(shard, np.uint8)
     payload[len(payload) // 2 :] = 0
     payload.tofile(shard)
-    with pytest.raises(SystemExit, match="1"):
-        command(inspect, tmp_path / "a")
+    command.finding(inspect, tmp_path / "a")
 
 
 @pytest.mark.parametrize(
@@ -228,16 +242,11 @@ def test_a_damaged_store_is_inspected_and_the_status_says_so(command: Command, t
         (ingest, ["folder", ".", "--test-share", "1"], "--test-share is 1.0"),
         (ingest, ["folder", ".", "--workers", "-7"], "--workers is -7"),
         (ingest, ["folder", ".", "--runner", "ray", "--workers", "-7"], "--workers is -7"),
-        (ingest, ["folder", ".", "--workers", "100000"], "--workers is 100000"),
         (ingest, ["folder", ".", "--gpus", "0.5"], "--gpus is for Ray alone; add --runner ray"),
         (ingest, ["folder", ".", "--runner", "ray", "--cpus", "0"], "--cpus is 0.0"),
         (ingest, ["folder", ".", "--out", "/"], "--out is /; name a directory"),
         (ingest, ["folder", ".", "--depth", "recorded:most_holes=2"], "most_holes is 2.0"),
-        (
-            ingest,
-            ["folder", ".", "--selection", "nowhere.json"],
-            "nowhere.json: not there; make it with rsjax doctor",
-        ),
+        (ingest, ["folder", ".", "--selection", "no.json"], "no.json: not there; make it with rsjax doctor"),
         (ingest, ["folder", ".", "--windows.frames", "1"], "windows.frames is 1"),
         (ingest, ["folder", ".", "--image-size", "1000000"], "--image-size is 1000000"),
         (ingest, ["folder", ".", "--points", "0"], "--points is 0"),
@@ -245,9 +254,11 @@ def test_a_damaged_store_is_inspected_and_the_status_says_so(command: Command, t
         (inspect, ["nowhere", "--sheet", "sheet.xyz"], "name a .png"),
         (inspect, ["nowhere"], "nowhere: not there; give a store"),
         (inspect, ["nowhere", "--records", "-1"], "inspect.records is -1; it must be at least 1"),
-        (inspect, ["nowhere", "--clips", "0"], "inspect.clips is 0; it must be at least 1"),
         (ingest, ["sim", "tests"], "tests: no store (it has no manifest.json); give a store, or make one"),
         (doctor, [], "usage: rsjax doctor STORE, or rsjax doctor SOURCE PATH"),
+        (doctor, ["rlsd"], "rlsd: no store"),
+        (doctor, ["rlds"], "rlds is a format; say where"),
+        (doctor, ["rlds", ".", "--lines", "-1"], "--lines is -1; it is 0 or more"),
         (store, [], "usage"),
         (store, ["merge", "a", "b"], "merging takes two stores or more"),
         (store, ["split", "--by", "task"], "missing STORE"),

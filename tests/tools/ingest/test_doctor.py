@@ -1,6 +1,4 @@
-import json
 import re
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -13,13 +11,11 @@ from hypothesis import strategies as st
 
 from rsjax.config import ConfigError
 from rsjax.processes import WorkerDied
-from rsjax.tools.commands import doctor as command
 from rsjax.tools.ingest import doctor
-from rsjax.tools.ingest.doctor import KINDS, Thresholds, diagnose, open_any, quaternions, select, write_selection
+from rsjax.tools.ingest.doctor import KINDS, Thresholds, diagnose, quaternions, select, write_selection
 from rsjax.tools.ingest.episode import Episode, EpisodeError, Segment, SourceError
 from rsjax.tools.ingest.formats import open_source
 from tests.tools.ingest.formats.test_folder import write_episode
-from tests.tools.ingest.formats.toy_tfrecord import bridge_episode, write_bridge
 from tests.tools.ingest.toy_source import COUNT, Pictures, ToySource, episode, pictures, source
 
 Change = Callable[[Episode], dict[str, Any]]
@@ -85,11 +81,6 @@ def _depth(last: float) -> np.ndarray:
     return changed(np.ones((COUNT, 4, 4), np.float32), -1, last)
 
 
-def test_a_sound_data_set_has_no_findings() -> None:
-    diagnosis = diagnose(source(), Thresholds())
-    assert not diagnosis.findings and len(diagnosis.refs) == 6
-
-
 @pytest.mark.parametrize(("kind", "detail", "change"), CASES, ids=[detail[:30] for _, detail, _ in CASES])
 def test_a_problem_is_found_where_it_is(kind: str, detail: str, change: Change) -> None:
     odd = episode(ODD)
@@ -115,14 +106,19 @@ def test_every_kind_is_tried() -> None:
     assert {kind for kind, _, _ in CASES} | {"unreadable", "seeking"} == set(KINDS)  # test_video_order.py
 
 
-@pytest.mark.parametrize("error", [EpisodeError("a.h5: truncated"), ZeroDivisionError("a surprise")])
-def test_an_unreadable_episode_does_not_hide_the_others(error: Exception) -> None:
+@pytest.mark.parametrize(
+    ("error", "kind", "detail"),
+    [
+        (EpisodeError("a.h5: truncated"), "unreadable", "a.h5: truncated"),
+        (EpisodeError("a.h5:\n\nwrong", "undecodable"), "undecodable", "a.h5: wrong"),
+        (ZeroDivisionError("a surprise"), "unreadable", "a surprise"),
+    ],
+)
+def test_an_unreadable_episode_does_not_hide_the_others(error: Exception, kind: str, detail: str) -> None:
     diagnosis = diagnose(source(error, replace(episode(7), task="")), Thresholds())
-    assert [(finding.episode, finding.kind) for finding in diagnosis.findings] == [
-        ("episode-6", "unreadable"),
-        ("episode-7", "no-task"),
-    ]
-    assert str(error) in diagnosis.findings[0].detail
+    found = [(finding.episode, finding.kind) for finding in diagnosis.findings]
+    assert found == [("episode-6", kind), ("episode-7", "no-task")]
+    assert detail in diagnosis.findings[0].detail
 
 
 def test_all_pictures_can_be_decoded() -> None:
@@ -190,11 +186,6 @@ def test_a_gripper_after_zeros_is_no_quaternion() -> None:
     assert "quaternion-flip" in diagnose(source(replace(gripper, meta={})), Thresholds()).counts()
 
 
-def test_a_readers_error_is_a_finding_of_its_kind_in_one_line() -> None:
-    diagnosis = diagnose(source(EpisodeError("a.h5:\n\nwrong", "undecodable")), Thresholds())
-    assert [(finding.kind, finding.detail) for finding in diagnosis.findings] == [("undecodable", "a.h5: wrong")]
-
-
 def test_what_a_reader_mended_is_noted_and_no_finding() -> None:
     notes = {"empty": ["state/waist"], "scattered": {"end": 3}, "depth_left_out": "7 maps for 8 frames"}
     diagnosis = diagnose(source(replace(episode(ODD), meta={"notes": notes})), Thresholds())
@@ -232,69 +223,51 @@ def test_damaged_files_are_findings_and_left_out(tmp_path: Path) -> None:
     assert good == ["one", "other"] and len(list(chosen.episodes())) == len(diagnosis.refs) == 7
 
 
-@pytest.mark.parametrize(
-    ("what", "path", "said"),
-    [
-        ("rlsd", None, "rlsd: no store .*did you mean 'rlds'"),
-        ("rlds", None, "rlds is a format; say where"),
-        ("rlsd", Path("."), "unknown format 'rlsd'; did you mean 'rlds'"),
-    ],
-)
-def test_neither_store_nor_format_is_refused(what: str, path: Path | None, said: str) -> None:
-    with pytest.raises(SourceError, match=said):
-        open_any(what, path)
+def test_episodes_of_one_name_are_all_counted_and_left_out(tmp_path: Path) -> None:
+    diagnosis = diagnose(source(replace(episode(7), id="episode-2")), Thresholds())
+    assert diagnosis.counts() == {"duplicate": 2}
+    assert write_selection(tmp_path / "m.json", "toy", diagnosis.refs, diagnosis.reasons()) == (5, 2)
 
 
-def run(monkeypatch: pytest.MonkeyPatch, *words: object) -> int:
-    monkeypatch.setattr(sys, "argv", ["doctor", *map(str, words)])
-    try:
-        command.main()
-    except SystemExit as stop:
-        return int(stop.code or 0)
-    return 0
+def test_the_fix_leaves_out_the_bad_ones_with_reasons_and_counts_them(tmp_path: Path) -> None:
+    data_set = source(replace(episode(6), task=""), episode(7))
+    diagnosis = diagnose(data_set, Thresholds())
+    assert write_selection(tmp_path / "m.json", "toy", diagnosis.refs, diagnosis.reasons()) == (7, 1)
+    chosen = select(data_set, tmp_path / "m.json")
+    refs = list(chosen.episodes())
+    assert [ref.id for ref in refs] == [f"episode-{number}" for number in range(8)]
+    assert [chosen.read(ref).id for ref in refs if ref.id != "episode-6"] == [r.id for r in refs if r.id != "episode-6"]
+    with pytest.raises(EpisodeError, match="episode-6: left out by the list: no-task: its task is empty"):
+        chosen.read(refs[6])
+    plain = {ref.id: ref.fingerprint for ref in data_set.episodes()}
+    assert [ref.id for ref in refs if ref.fingerprint != plain[ref.id]] == ["episode-6"]
 
 
-def test_the_commands_status(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    write_bridge(tmp_path / "data", [bridge_episode(5), bridge_episode(4, task=""), b"\xff"])
-    fix = tmp_path / "m.json"
-    assert run(monkeypatch, "rlds", tmp_path / "data", "--option", "split=train", "--fix", fix) == 1
-    printed = capsys.readouterr().out
-    assert "train-00000-00001: no-task" in printed and "train-00000-00002: unreadable" in printed
-    assert "3 episodes: 1 without a finding, 2 with" in printed
-    assert [entry["id"] for entry in json.loads(fix.read_text())["left_out"]] == [
-        "train-00000-00001",
-        "train-00000-00002",
-    ]
-    write_bridge(tmp_path / "data", [bridge_episode(5), bridge_episode(4, task="")])
-    assert run(monkeypatch, "rlds", tmp_path / "data", "--ignore", "no-task") == 0
-    write_bridge(tmp_path / "data", [bridge_episode(4, task="")])
-    assert run(monkeypatch, "rlds", tmp_path / "data") == 1
-    assert "all are 'no-task': if that is as it should be, --ignore no-task" in capsys.readouterr().out
-    assert run(monkeypatch, "rlds", tmp_path / "nowhere") == 2
-    assert run(monkeypatch, "rlds", tmp_path / "data", "--option", "split") == 2
-    assert run(monkeypatch, "rlds", tmp_path / "data", "--lines", "-1") == 2
-    assert "--lines is -1; it is 0 or more" in capsys.readouterr().err
+def test_an_episode_that_was_mended_is_read_again(tmp_path: Path) -> None:
+    bad = replace(episode(6), task="")
+    diagnosis = diagnose(source(bad), Thresholds())
+    write_selection(tmp_path / "m.json", "toy", diagnosis.refs, diagnosis.reasons())
+    mended = select(source(replace(bad, task="lift", fingerprint="0" * 16)), tmp_path / "m.json")
+    assert [mended.read(ref).task for ref in mended.episodes()][6] == "lift"
 
 
-def test_a_fix_that_keeps_nothing_says_what_to_do(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    write_bridge(tmp_path / "data", [bridge_episode(4, task=""), bridge_episode(5, task="")])
-    line = ("rlds", tmp_path / "data", "--fix", tmp_path / "m.json")
-    assert run(monkeypatch, *line) == 1
-    (printed,) = [row for row in capsys.readouterr().out.splitlines() if row.startswith(str(tmp_path / "m.json"))]
-    assert "keeps 0, leaves out 2; nothing is left to ingest: --ignore no-task, and write it again" in printed
-    assert run(monkeypatch, *line, "--ignore", "no-task") == 0
-    assert f"{tmp_path / 'm.json'}: keeps 2, leaves out 0\n" in capsys.readouterr().out
-
-
-def test_what_makes_everything_unreadable_is_never_to_be_ignored(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    write_bridge(tmp_path / "data", [b"\xff", b"\xff\xff"])
-    assert run(monkeypatch, "rlds", tmp_path / "data", "--fix", tmp_path / "m.json") == 1
-    printed = capsys.readouterr().out
-    assert "unreadable" in printed and "--ignore" not in printed
-    assert "keeps 0, leaves out 2; nothing is left to ingest: mend what is wrong, and write it again" in printed
+def test_a_list_of_something_else_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "m.json"
+    diagnosis = diagnose(source(), Thresholds())
+    write_selection(path, "toy", diagnosis.refs, diagnosis.reasons())
+    whole = path.read_text()
+    write_selection(path, "toy", (("other", "0" * 16),), {})
+    of_another = path.read_text()
+    others = ToySource(tuple(replace(episode(seed), fingerprint="1" * 16) for seed in range(6)))
+    no_lists = ("", "[]", "{}", '{"format": 2}', '{"format": 1, "kept": 3, "left_out": []}', "[" * 100_000)
+    for data_set, content, message in (
+        (source(), None, "not there"),
+        (others, whole, "the data set was read with other options then"),
+        (source(), of_another, "names no episode of this data set"),
+        *((source(), content, "not a list of") for content in no_lists),
+    ):
+        path.unlink(missing_ok=True)
+        if content is not None:
+            path.write_text(content)
+        with pytest.raises(SourceError, match=f"m.json: {message}"):
+            select(data_set, path)

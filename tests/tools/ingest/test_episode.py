@@ -37,11 +37,6 @@ GOOD = Episode(
 )
 
 
-def test_a_good_episode_passes() -> None:
-    assert checked(GOOD, "f") is GOOD
-    assert checked(alone := replace(GOOD, states=None), "f") is alone
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -69,7 +64,7 @@ def test_an_error_that_comes_from_another_process_keeps_its_kind() -> None:
     assert (str(error), error.kind, EpisodeError("f").kind) == ("f: late", "time", "unreadable")
 
 
-@given(st.lists(st.text(), unique=True, max_size=20))
+@given(st.lists(st.text(st.characters(exclude_categories=())), unique=True, max_size=20))  # and what is no text
 def test_ids_are_file_names_and_stay_apart(texts: list[str]) -> None:
     ids = [safe_id(text) for text in texts]
     assert len(set(ids)) == len(ids)

@@ -87,7 +87,7 @@ def test_stores_are_the_same_from_ray_processes_and_this_process(tmp_path: Path,
     stores = []
     for name, run in runners.items():
         methods = Annotators(motion=None, semantics=None)
-        plan = clip_plan(tmp_path / name, Source(4, broken=(2,), depth=True), methods)
+        plan = clip_plan(tmp_path / name, Source(4, broken=(2,), deep=range(4)), methods)
         ingest(plan, run)
         stores.append({path.name: path.read_bytes() for path in plan.out.iterdir()})
     assert stores[0] == stores[1] == stores[2] and "manifest.json" in stores[0]

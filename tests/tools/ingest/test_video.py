@@ -37,15 +37,6 @@ def test_av1(tmp_path: Path) -> None:
     assert numbers_of(frames.read([11, 0, 5])) == [11, 0, 5]
 
 
-def test_frames_that_lean_on_the_group_before(tmp_path: Path) -> None:
-    groups = "open-gop=1:keyint=6:min-keyint=6:bframes=3:b-adapt=0:scenecut=0"
-    path = write_video(tmp_path / "open.mp4", range(30), options={"x264-params": groups})
-    assert 1 < scan(path).keys.sum() < 30
-    for number in reversed(range(30)):
-        assert numbers_of(VideoFrames(path).read([number])) == [number]
-    assert numbers_of(VideoFrames(path).read(range(30))) == list(range(30))
-
-
 def test_frames_are_upright(tmp_path: Path) -> None:
     for rotation, corner in ((0, (0, 0)), (90, (-1, 0)), (180, (-1, -1)), (-90, (0, -1))):
         path = write_video(tmp_path / f"turned{rotation}.mp4", range(1), size=(48, 64), rotation=rotation)

@@ -3,7 +3,7 @@
 import os
 import signal
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Container, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -76,19 +76,12 @@ def episode(name: str, count: int = 40, depth: bool = False, **fields: Any) -> E
 
 @dataclass
 class Source:
-    """``count`` episodes of 40 frames; those in ``broken`` cannot be read, those in ``short`` have 5 frames.
-
-    Attributes:
-        deep: how many of them, from the first on, have depth even if ``depth`` is False.
-        only: one more that has.
-    """
+    """``count`` episodes of 40 frames; ``broken`` ones are unreadable, ``short`` ones have 5, ``deep`` ones depth."""
 
     count: int
     broken: tuple[int, ...] = ()
     short: tuple[int, ...] = ()
-    depth: bool = False
-    deep: int = 0
-    only: int = -1
+    deep: Container[int] = ()
     version: str = "0"
     name: str = "toy"
 
@@ -101,8 +94,7 @@ class Source:
         if number in self.broken:
             raise EpisodeError(f"video_{number}.mp4: truncated; copy it again")
         frames = 5 if number in self.short else 40
-        deep = self.depth or number < self.deep or number == self.only
-        return episode(ref.id, frames, deep, fingerprint=ref.fingerprint)
+        return episode(ref.id, frames, number in self.deep, fingerprint=ref.fingerprint)
 
 
 @dataclass(frozen=True)

@@ -304,48 +304,31 @@ def test_a_comparison_of_a_run_with_itself(
     assert json.loads((tmp_path / "compare.json").read_text())["protocol"]["name"] == "paper"
 
 
-@pytest.mark.parametrize(
-    ("request_", "says"),
-    [
-        (
-            EvaluationRequest("paper"),
-            "predicts 15 frames after 1, so it takes clips of 16 frames; .* have 6: lower --horizon",
-        ),
-        (
-            EvaluationRequest("paper", CHANGES, splits=("unseen",)),
-            "no split 'unseen'; it has train, test: choose with --split",
-        ),
-        (EvaluationRequest("unseen", CHANGES), r"no split 'unseen\*'; it has train, test"),
-        (EvaluationRequest("paper", CHANGES, data=Path("nowhere")), "nowhere: not there"),
-        (
-            EvaluationRequest("paper", CHANGES | {"depth_source": "estimator"}),
-            "estimator needs a network .* --eval.depth-estim",
-        ),
-        (
-            EvaluationRequest("paper", CHANGES | {"prompt_frames": 10**9}),
-            "clips of 1000000005 frames, each generated .* are more",
-        ),
-        (
-            EvaluationRequest("paper", CHANGES | {"samples": 9_999_999}),
-            "each generated .* lower --clips, .* --samples, ",
-        ),
-        (
-            EvaluationRequest("paper", CHANGES | {"repetitions": 9_999_999}),
-            "each generated .* --repetitions or --action-draws",
-        ),
-        (
-            EvaluationRequest("paper", CHANGES | {"action_draws": 9_999_999}),
-            "each generated .* --repetitions or --action-draws",
-        ),
-        (EvaluationRequest("paper", CHANGES | {"steps": 999_999}), r"steps is 999999, but a frame has \d+ cells"),
-        (EvaluationRequest("paper", {"resolution": 999}), "scores frames of 999 pixels per side; those of .*run have"),
-        (EvaluationRequest("paper", CHANGES | {"resolution": 1}), "resolution is 1; frames have at least 16 pixels"),
-        (EvaluationRequest("paper", CHANGES, {"weights": "nowhere"}), "eval.weights is nowhere: no such directory"),
-    ],
-)
-def test_what_cannot_be_evaluated_is_one_line(run: Run, request_: EvaluationRequest, says: str) -> None:
+def asked(**changes: Any) -> EvaluationRequest:
+    return EvaluationRequest("paper", CHANGES | changes)
+
+
+REFUSED = {
+    "predicts 15 frames after 1, .* clips of 16 frames; .* have 6: lower --horizon": EvaluationRequest("paper"),
+    "no split 'unseen'; it has train, test: choose with --split": replace(asked(), splits=("unseen",)),
+    r"no split 'unseen\*'; it has train, test": EvaluationRequest("unseen", CHANGES),
+    "nowhere: not there": replace(asked(), data=Path("nowhere")),
+    "estimator needs a network .* --eval.depth-estim": asked(depth_source="estimator"),
+    "clips of 1000000005 frames, each generated .* are more": asked(prompt_frames=10**9),
+    "each generated .* lower --clips, .* --samples, ": asked(samples=9_999_999),
+    "each generated .* --repetitions or --action-draws": asked(repetitions=9_999_999),
+    "--repetitions or --action-draws": asked(action_draws=9_999_999),
+    r"steps is 999999, but a frame has \d+ cells": asked(steps=999_999),
+    "scores frames of 999 pixels per side; those of .*run have": EvaluationRequest("paper", {"resolution": 999}),
+    "resolution is 1; frames have at least 16 pixels": asked(resolution=1),
+    "eval.weights is nowhere: no such directory": replace(asked(), settings={"weights": "nowhere"}),
+}
+
+
+@pytest.mark.parametrize("says", REFUSED)
+def test_what_cannot_be_evaluated_is_one_line(run: Run, says: str) -> None:
     with pytest.raises(UserError, match=says) as refused:
-        list(evaluate_run(run.directory, run.data_directory, request_))
+        list(evaluate_run(run.directory, run.data_directory, REFUSED[says]))
     assert "\n" not in str(refused.value)
 
 
@@ -377,16 +360,14 @@ def test_only_splits_that_there_can_be_are_simulated(
     assert evaluation_store(simulating, store, protocol) == (simulated or store)
 
 
+IN_LIFT_ALONE = "grasps and drives are simulated in Lift alone; the clips are of"
+
+
 @pytest.mark.parametrize(
     ("source", "split", "changes", "reason"),
     [
-        (None, "test", {}, "grasps and drives are simulated in Lift alone; the clips are of recordings"),
-        (
-            "metaworld/Sawyer",
-            "test",
-            {},
-            "grasps and drives are simulated in Lift alone; the clips are of metaworld/Sawyer",
-        ),
+        (None, "test", {}, f"{IN_LIFT_ALONE} recordings"),
+        ("metaworld/Sawyer", "test", {}, f"{IN_LIFT_ALONE} metaworld/Sawyer"),
         (LIFT, "train", {}, "grasps and drives are scored with the split test, not with train"),
         (LIFT, "test", {"teacher_forced": True}, "protocol paper gives the true frames before each predicted one"),
         (LIFT, "test", {}, "5 clips are scored; grasps and drives are simulated where 48 or more are"),
@@ -414,7 +395,7 @@ def test_longer_episodes_are_none_of_the_runs_own() -> None:
     assert replace(longer, frames=sim.frames, seed=0, episodes=sim.episodes, test_episodes=sim.test_episodes) == sim
 
 
-def test_commands_without_runs_say_how(command: Commands, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_commands_without_runs_say_how(command: Commands) -> None:
     assert "name a run directory" in command.refused("experiments.evaluate", "--protocol", "paper")
     assert "unknown argument '--protocl'; did you mean '--protocol'" in command.refused(
         "experiments.evaluate", "--protocl"

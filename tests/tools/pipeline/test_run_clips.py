@@ -138,7 +138,12 @@ def partly_blind(path: Path) -> Store:
 
 
 def test_depth_is_scored_where_clips_have_it_and_nothing_else_changes(tmp_path: Path) -> None:
-    some, all_ = partly_blind(tmp_path / "some"), open_store(tmp_path / "whole")
+    """In the store that has depth, a train clip is damaged, which does not keep a run from its scores."""
+    some = partly_blind(tmp_path / "some")
+    all_ = open_store(tmp_path / "whole")
+    damage(all_, "train", 0)
+    data = on_store(presets.debug(), all_.path).data
+    assert data is not None and data.key == "toy"
     trained = toy.trained(all_)
     found, whole = evaluation.evaluate(trained, some), evaluation.evaluate(trained, all_)
     seen = [i for i in range(toy.TEST) if i not in BLIND["test"]]
@@ -152,6 +157,7 @@ def test_depth_is_scored_where_clips_have_it_and_nothing_else_changes(tmp_path: 
         )
     assert found.metrics["depth_absrel"] == pytest.approx(np.mean(one_by_one), rel=1e-4)
     assert found.metrics["psnr_tokenizer"] == whole.metrics["psnr_tokenizer"]
+    assert np.isfinite(whole.metrics["delta_psnr_uniform"])
     shown = {int(clip): bool(has) for clip, has in zip(found.shown["clip"], found.shown["has_depth"], strict=True)}
     assert shown == {clip: clip in seen for clip in shown}
 
@@ -164,14 +170,6 @@ def test_a_store_without_any_depth_has_no_scores_of_it(tmp_path: Path) -> None:
     assert reasons == {"no test clip has depth in metres"}
     assert "predicted_depth" not in found.shown
     assert np.isfinite(found.metrics["psnr"])
-
-
-def test_a_damaged_train_clip_does_not_keep_a_run_from_its_scores(tmp_path: Path) -> None:
-    clips = toy.store(tmp_path / "clips")
-    damage(clips, "train", 0)
-    assert np.isfinite(evaluation.evaluate(toy.trained(clips), clips).metrics["delta_psnr_uniform"])
-    data = on_store(presets.debug(), clips.path).data
-    assert data is not None and data.key == "toy"
 
 
 def test_tokens_of_clips_without_depth_train_with_that_term_masked(tmp_path: Path) -> None:

@@ -23,7 +23,9 @@ def random_params(init: Any) -> Any:
     return jax.tree.map(lambda x: rng.normal(scale=0.1, size=x.shape).astype(np.float32), shapes)
 
 
-def test_a_run_of_no_steps_keeps_the_weights_that_it_starts_from(tmp_path: Path) -> None:
+def test_a_run_of_no_steps_keeps_the_weights_that_it_starts_from(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     cfg, public = toy.config(), tmp_path / "public"
     tokenizer = random_params(Tokenizer(cfg.tokenizer).init_params)
     alone = replace(Architecture.create(cfg), depth="none", action_encoder="none", action_inputs=0)
@@ -40,6 +42,7 @@ def test_a_run_of_no_steps_keeps_the_weights_that_it_starts_from(tmp_path: Path)
     run.prepare(overwrite=False)
     toy.store(run.clips)
     train_tokenizer(run, resume=True)
+    assert "LPIPS" not in capsys.readouterr().out, "a term that is off is not missed"
     meta = {"key": "toy", "action_mean": [0.0], "action_std": [1.0], "depth_range": None}
     write_store(run.output("tokens"), "tokens", {"train": iter([{"rgb": np.zeros(3, np.int32)}])}, meta)
     train_world_model(run, resume=True)

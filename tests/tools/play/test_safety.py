@@ -73,14 +73,16 @@ def test_without_the_token_nobody_comes_in(run: PlayRun) -> None:
 
 
 def test_no_path_comes_from_outside(server: Server) -> None:
-    for path in ("/page/../serve.py", "/page/..%2fserve.py", "/page//etc/passwd", "/etc/passwd", "/api/clip/-1.webp"):
+    clips = (f"/api/clip/{number}.webp" for number in (-1, "9" * 4400))
+    for path in ("/page/../serve.py", "/page/..%2fserve.py", "/page//etc/passwd", "/etc/passwd", *clips):
         assert server.get(path)[0] == 404
     status, headers, _ = server.get("/api/clip/0.webp")
     assert status == 200 and headers["content-type"] == "image/webp"
     assert "script-src 'self'" in headers["content-security-policy"] and headers["cache-control"] == "no-store"
-    assert server.get("/api/clips?first=x")[0] == server.get("/api/clips?count=1000")[0] == 400
-    clips = json.loads(server.get("/api/clips?first=3")[2])
-    assert [clip["clip"] for clip in clips["clips"]] == [3, 4] and clips["total"] == 5
+    for query in ("first=x", "count=1000", f"first={'9' * 4400}"):
+        assert server.get(f"/api/clips?{query}")[0] == 400
+    listed = json.loads(server.get("/api/clips?first=3")[2])
+    assert [clip["clip"] for clip in listed["clips"]] == [3, 4] and listed["total"] == 5
     assert server.get("/api/health", method="POST")[0] in (404, 405)
 
 
@@ -105,25 +107,6 @@ def test_garbage_is_refused_and_in_the_end_its_sender_too(server: Server) -> Non
         assert closing(page)[0] in (1009, 0)  # it may end before its last word is read
     with server.client() as (page, _):
         assert page.ask("ping")["type"] == "pong"
-
-
-def test_numbers_without_bounds_are_refused_where_they_come_in(server: Server) -> None:
-    assert server.get(f"/api/clip/{'9' * 4400}.webp")[0] == server.get("/api/clip/-1.webp")[0] == 404
-    assert server.get(f"/api/clips?first={'9' * 4400}")[0] == 400
-    with server.client() as (page, welcome):
-        page.ask("start", clip=0)
-        huge = 10**400
-        rest = [each["rest"] for each in welcome["controls"]]
-        for kind, code, fields in (
-            ("settings", "bad_settings", {"temperature": huge}),
-            ("settings", "bad_settings", {"steps": -huge}),
-            ("step", "bad_action", {"branch": 0, "action": [huge, *rest[1:]]}),
-            ("step", "bad_action", {"branch": 0, "action": [1e300, *rest[1:]]}),
-            ("step", "bad_message", {"branch": huge, "action": rest}),
-            ("record", "bad_message", {"format": "gif", "branch": 0, "panes": ["rgb"], "fps": huge}),
-            ("start", "bad_message", {"clip": huge}),
-        ):
-            assert page.ask(kind, **fields)["error"] == code, (kind, fields)
 
 
 def test_a_flood_is_slowed_and_then_ended(server: Server) -> None:

@@ -21,6 +21,8 @@ from tests.tools.play.client import Client, Picture, Server
 from tests.tools.play.fake import LIGHT, MEASURED, Fakes
 from tests.waiting import wait_until
 
+HUGE = 10**400
+
 
 def rgb(picture: Picture) -> np.ndarray:
     return np.asarray(Image.open(io.BytesIO(picture.payload)).convert("RGB"))
@@ -240,6 +242,12 @@ def test_frames_of_two_viewers_share_passes_and_keep_their_bits(server: Server, 
         ({"type": "frames", "branch": 0, "first": 9, "count": 1, "kinds": ["rgb"]}, "no_frame"),
         ({"type": "frames", "branch": 0, "first": 0, "count": 65, "kinds": ["rgb"]}, "bad_message"),
         ({"type": "fly"}, "bad_message"),
+        ({"type": "settings", "temperature": HUGE}, "bad_settings"),
+        ({"type": "settings", "steps": -HUGE}, "bad_settings"),
+        ({"type": "step", "branch": 0, "action": [HUGE] + [0] * 6}, "bad_action"),
+        ({"type": "step", "branch": HUGE, "action": [0] * 7}, "bad_message"),
+        ({"type": "record", "format": "gif", "branch": 0, "panes": ["rgb"], "fps": HUGE}, "bad_message"),
+        ({"type": "start", "clip": HUGE}, "bad_message"),
     ],
 )
 def test_what_cannot_be_done_is_refused_by_name(server: Server, message: dict[str, object], code: str) -> None:

@@ -44,6 +44,8 @@ def test_options_become_the_settings_of_each_part() -> None:
         ("policy_learning", ("--counts", "0"), r"--counts \(0,\) and --seeds 1 must be 1 at least"),
         ("policy_learning", ("--episodes", "0"), "--episodes is 0; it must be at least 1"),
         ("improve", ("--share", "1"), "--share is 1"),
+        ("adapt", ("--share", "1"), "--share is 1.0; it is a share"),
+        ("adapt", ("--rounds", "3"), "--rounds is 3; it is 1 or 2"),
         ("synthesize", ("--noise", "nan"), "--noise nan: 1, 1 and 0 at least"),
         ("synthesize", ("--demo", "3"), "did you mean '--demos'"),
     ],

@@ -54,12 +54,7 @@ def test_the_public_size_is_the_public_one() -> None:
     assert (config.observations, config.horizon, config.execute) == (2, 16, 8)
     assert (config.noise_steps, config.sample_steps, config.keypoints) == (100, 100, 32)
     optimizer = config.train.optimizer
-    assert (optimizer.learning_rate, *optimizer.betas, optimizer.weight_decay) == (
-        1e-4,
-        0.95,
-        0.999,
-        1e-6,
-    )
+    assert (optimizer.learning_rate, *optimizer.betas, optimizer.weight_decay) == (1e-4, 0.95, 0.999, 1e-6)
     assert (optimizer.schedule, optimizer.warmup_steps, config.train.ema) == ("cosine", 500, 0.9999)
     shapes = jax.eval_shape(net.init, jax.random.key(0))
     condition, kernel, total = 128 + 2 * 64, 5, 0
@@ -78,7 +73,7 @@ def test_the_public_size_is_the_public_one() -> None:
     assert sum(leaf.size for leaf in jax.tree.leaves(shapes["unet"])) == total
 
 
-@pytest.mark.parametrize(("kernel", "stride"), [(5, 1), (3, 2), (1, 1)])
+@pytest.mark.parametrize(("kernel", "stride"), [(5, 1), (3, 2)])
 def test_convolution_equals_flax(kernel: int, stride: int) -> None:
     x: Any = jax.random.normal(jax.random.key(0), (2, 8, 3))
     own: Any = Conv(4, kernel, stride)
@@ -228,13 +223,25 @@ def test_going_on_from_a_policy_starts_with_its_weights(
     assert again.range == policy[0].range != others.range
 
 
-def test_actions_follow_from_the_seed_and_stay_in_the_demonstrations_range(policy: tuple[Policy, Path]) -> None:
+def test_actions_and_plans_follow_from_the_seed_and_stay_in_the_demonstrations_range(
+    policy: tuple[Policy, Path],
+) -> None:
+    made, _ = policy
     frames = np.stack([picture(2), picture(9)])
-    one, same, other = (policy[0].actor(seed)({"rgb": frames}) for seed in (0, 0, 1))
+    one, same, other = (made.actor(seed)({"rgb": frames}) for seed in (0, 0, 1))
     np.testing.assert_array_equal(one, same)
     assert one.shape == (2, CONTROLS * WIDTH) and np.abs(one - other).max() > 0
-    low, high = (np.tile(end, CONTROLS) for end in (policy[0].range.low, policy[0].range.high))
-    assert (one >= low - 1e-6).all() and (one <= high + 1e-6).all()
+    videos = frames[None, -1:].repeat(2, axis=0)
+    plans = made.plans(videos, seed=0)
+    config = made.model.config
+    assert plans.shape == (2, config.horizon // CONTROLS, CONTROLS * WIDTH)
+    assert not np.array_equal(plans[0], plans[1]), "each video has its own draws"
+    assert not np.array_equal(plans, made.plans(videos, seed=1))
+    np.testing.assert_array_equal(plans, made.plans(videos.repeat(config.observations, axis=1), seed=0))
+    for found in (one, plans):
+        controls = found.reshape(-1, WIDTH)
+        assert (controls >= np.array(made.range.low) - 1e-6).all()
+        assert (controls <= np.array(made.range.high) + 1e-6).all()
 
 
 class Recall(DiffusionPolicy):
@@ -301,17 +308,3 @@ def test_demos_that_succeed_are_chosen(tmp_path: Path, capsys: pytest.CaptureFix
     merged = merge([unlabelled.path, *(part.path for part in parts)], tmp_path / "merged")
     assert len(load_demos(merged, merged.splits)) == 12
     assert "merged: does not say which of its clips end in success, so all that begin" in capsys.readouterr().out
-
-
-def test_plans_are_what_an_actor_would_do_next(policy: tuple[Policy, Path]) -> None:
-    made, _ = policy
-    frames = np.stack([picture(place) for place in (1, 3)])
-    videos = frames[None, -1:].repeat(3, axis=0)
-    plans = made.plans(videos, seed=0)
-    config = made.model.config
-    assert plans.shape == (3, config.horizon // CONTROLS, CONTROLS * WIDTH)
-    assert not np.array_equal(plans[0], plans[1])
-    np.testing.assert_array_equal(plans, made.plans(videos.repeat(config.observations, axis=1), seed=0))
-    low, high = np.array(made.range.low), np.array(made.range.high)
-    controls = plans.reshape(-1, WIDTH)
-    assert ((controls >= low - 1e-6) & (controls <= high + 1e-6)).all()

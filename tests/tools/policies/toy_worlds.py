@@ -5,12 +5,15 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import jax
 import numpy as np
 
 from rsjax.clip import Video
 from rsjax.files import write_json
 from rsjax.tools.policies.config import toy as toy_size
 from rsjax.tools.policies.diffusion_policy import DiffusionPolicy
+from rsjax.tools.policies.judges.judge import HISTORY
+from rsjax.tools.policies.judges.trained_judge import JudgeNetwork, TrainedJudge
 from rsjax.tools.policies.worlds.actions import PANDA_UNIT, ActionRange
 from rsjax.tools.policies.worlds.model_world import ModelWorld
 from rsjax.tools.policies.worlds.simulator_world import SimulatorWorld
@@ -95,6 +98,15 @@ def judge(frames: np.ndarray) -> np.ndarray:
     """Success is a dot at column 10 or farther in the last frame."""
     done = frames[:, -1, 7, :, 0].argmax(-1) >= 10
     return np.stack([done, ~done, np.zeros_like(done)], -1).astype(float)
+
+
+def untrained_judge(side: int, temperature: float = 1.0) -> TrainedJudge:
+    """A judge with random parameters, for frames of ``side`` pixels."""
+    frames = jax.ShapeDtypeStruct((1, HISTORY, side, side, 3), np.uint8)
+    shapes = jax.eval_shape(JudgeNetwork().init, jax.random.key(0), frames)["params"]
+    rng = np.random.default_rng(0)
+    params = jax.tree.map(lambda x: rng.normal(scale=0.1, size=x.shape).astype(np.float32), shapes)
+    return TrainedJudge(params, temperature, side)
 
 
 def imagined(count: int, pace: float = 1.0, judge: Any = judge, draws: list[list[int]] | None = None) -> ModelWorld:

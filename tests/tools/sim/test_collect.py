@@ -1,5 +1,4 @@
 import errno
-import multiprocessing
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from dataclasses import replace
@@ -17,8 +16,10 @@ from rsjax.processes import WorkerDied
 from rsjax.tools.sim import collect as collect_module
 from rsjax.tools.sim import panda as panda_module
 from rsjax.tools.sim.collect import CollectError, collect, collection_key
+from rsjax.tools.sim.contacts import collect_contacts, contact_splits
 from rsjax.tools.sim.episode import EpisodePlan, Simulators, run_episode
 from rsjax.tools.sim.lift import LiftSim
+from rsjax.tools.sim.recipes.plans import RECIPES, training_plans
 
 CONFIG = SimConfig(episodes=4, test_episodes=1, frames=4, tracks=20, seed=5)
 
@@ -45,21 +46,6 @@ def test_an_episode_depends_only_on_seed_and_number(sim: LiftSim) -> None:
     assert not np.array_equal(other.actions, clips[3].actions)
 
 
-def test_actions_are_what_led_to_the_frame(sim: LiftSim) -> None:
-    """Replaying the stored actions from the same start gives the same pictures."""
-    clip = run_episode(sim, CONFIG, plan(1))
-    assert clip.actions.shape == (4, CONFIG.action_dim)
-    assert not clip.actions[0].any()
-    sim.reset(int(np.random.default_rng([CONFIG.seed, 1]).integers(2**32)))
-    for t in range(CONFIG.frames):
-        for action in clip.actions[t].reshape(-1, 7) if t else ():
-            sim.step(action)
-        view = sim.render()
-        np.testing.assert_array_equal(view.rgb, clip.rgb[t])
-        assert clip.depth is not None
-        np.testing.assert_array_equal(view.depth, clip.depth[t])
-
-
 def test_computing_each_state_once_changes_no_physics(sim: LiftSim, monkeypatch: pytest.MonkeyPatch) -> None:
     clip = run_episode(sim, CONFIG, plan(2))
     monkeypatch.setattr(panda_module, "compute_states_once", lambda sim: None)
@@ -79,8 +65,11 @@ def test_a_state_that_comes_back_after_a_reset_is_computed_again(sim: LiftSim) -
     np.testing.assert_array_equal(sim.body_poses()[0], poses[0])
 
 
-def test_collect_resumes_survives_a_killed_worker_and_packs(sim: LiftSim, tmp_path: Path) -> None:
-    out, partial = tmp_path / "lift", tmp_path / "lift.partial"
+def test_collect_resumes_a_mix_of_recipes_and_packs_it(sim: LiftSim, tmp_path: Path) -> None:
+    config = replace(CONFIG, recipe=("grasps", "driving"))
+    plans = (*training_plans(config), plan(3))  # the test clip is the expert's
+    out = tmp_path / "lift"
+    partial = tmp_path / "lift.partial"
 
     def interrupt_after_one(done: int, total: int) -> None:
         assert total == 4
@@ -88,38 +77,31 @@ def test_collect_resumes_survives_a_killed_worker_and_packs(sim: LiftSim, tmp_pa
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        collect(CONFIG, out, interrupt_after_one, workers=1)  # a simulator takes seconds to start
+        collect(config, out, interrupt_after_one, workers=1)  # a simulator takes seconds to start
     kept = list(partial.glob("*.clip"))
     assert kept
     assert not out.exists()
     # an episode that is there is not simulated again: this one says so
     mark = kept[0]
-    episode = int(mark.stem)
-    clip = run_episode(sim, CONFIG, plan(episode))
-    mark.write_bytes(encode(encode_clip(clip) | {"task": "marked"}))
+    marked = int(mark.stem)
+    mark.write_bytes(encode(encode_clip(run_episode(sim, config, plans[marked])) | {"task": "marked"}))
 
     seen: list[int] = []
-
-    def kill_at_once(done: int, total: int) -> None:
-        """A worker that dies costs its episode another try and the collection nothing."""
-        seen.append(done)
-        for child in multiprocessing.active_children() if len(seen) == 2 else ():
-            child.kill()
-
-    collect(CONFIG, out, kill_at_once, workers=1)
+    collect(config, out, lambda done, total: seen.append(done), workers=1)
     assert seen[0] >= 1
     assert seen[-1] == 4
     assert not partial.exists()
-    assert complete_key(out) == collection_key(CONFIG)
+    assert complete_key(out) == collection_key(config)
 
     store = open_store(out)
-    train, test = store.source("train"), store.source("test")
+    train = store.source("train")
+    test = store.source("test")
     assert (len(train), len(test)) == (3, 1)
-    clips = [Clip(**r) for r in [*(train[i] for i in range(3)), test[0]]]
-    assert [c.provenance["episode"] for c in clips] == [0, 1, 2, 3]
-    assert [c.task == "marked" for c in clips] == [i == episode for i in range(4)]
-    untouched = next(i for i in range(4) if i != episode)
-    assert_same(run_episode(sim, CONFIG, plan(untouched)), clips[untouched])
+    clips = [Clip(**record) for record in [*(train[number] for number in range(3)), test[0]]]
+    for number, clip in enumerate(clips):
+        assert (clip.task == "marked") == (number == marked)
+        if number != marked:
+            assert_same(run_episode(sim, config, plans[number]), clip)
 
     actions = np.concatenate([c.actions[1:] for c in clips[:3]])
     np.testing.assert_allclose(store.manifest["action_mean"], actions.mean(0), atol=1e-6)
@@ -128,9 +110,16 @@ def test_collect_resumes_survives_a_killed_worker_and_packs(sim: LiftSim, tmp_pa
     depth = np.stack([c.depth for c in clips[:3] if c.depth is not None])
     assert (near, far) == (depth.min(), depth.max())
     assert clips[3].provenance["depth_range"] == [near, far]
+    assert store.manifest["modes"].keys() >= {"grasps", "driving"}
 
-    collect(CONFIG, out, lambda done, total: seen.append(-done))
+    collect(config, out, lambda done, total: seen.append(-done))
     assert seen[-1] == -4, "already there: nothing to do"
+
+    contacts = collect_contacts(config, store, 1, lambda done, total: None, workers=1)
+    assert contacts.splits == contact_splits(config) == tuple(f"contacts_{name}" for name in RECIPES)
+    assert contacts.manifest["depth_range"] == store.manifest["depth_range"]
+    assert [contacts.source(split)[0]["provenance"]["expert"]["mode"] for split in contacts.splits] == list(RECIPES)
+    assert not contact_splits(replace(config, env="metaworld", camera="near", recipe=("expert",)))
 
 
 def prepared(tmp_path: Path, config: SimConfig, failed: range) -> Path:

@@ -48,7 +48,7 @@ def test_the_actions_of_a_probe_lead_to_its_frames(sim: LiftSim) -> None:
     for manner in (Grasp(0.02, 1, 0.0), Drive()):
         clip = run_episode(sim, CONFIG, EpisodePlan("x", 1, manner=manner))
         again = run_episode(sim, CONFIG, EpisodePlan("x", 1, manner=manner, replay=Replay(clip.actions, 0.0)))
-        for name in ("rgb", "depth", "actions", "success"):
+        for name in ("rgb", "depth", "actions", "tracks", "success"):
             np.testing.assert_array_equal(getattr(again, name), getattr(clip, name), err_msg=name)
         assert clip.provenance["expert"] == to_dict(manner)
 

@@ -2,7 +2,6 @@
 
 from collections import Counter
 from dataclasses import asdict, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,9 +9,8 @@ import pytest
 from rsjax.config import SimConfig
 from rsjax.config.sim import EXPERT
 from rsjax.config.sim import RECIPES as NAMES
-from rsjax.data.store import encode_clip, open_store
-from rsjax.tools.sim.collect import collect, collection_key
-from rsjax.tools.sim.contacts import collect_contacts, contact_splits
+from rsjax.data.store import encode_clip
+from rsjax.tools.sim.collect import collection_key
 from rsjax.tools.sim.episode import EpisodePlan, clip_seed, run_episode
 from rsjax.tools.sim.expert import OPEN, Expert, LiftState, Manner
 from rsjax.tools.sim.lift import LiftSim
@@ -40,13 +38,19 @@ def play(sim: LiftSim, plan: EpisodePlan) -> tuple[np.ndarray, np.ndarray, np.nd
     return np.array(actions), np.array(gripper), np.array(success)
 
 
+def short(config: SimConfig, name: str, place: int) -> EpisodePlan:
+    """Returns an episode of a recipe; a clip of ``midway`` begins with its third frame at the latest."""
+    plan = scripted(config, name, place, f"{place}")
+    return replace(plan, lead=min(plan.lead, 2))
+
+
 def test_the_configuration_names_the_recipes_that_there_are() -> None:
     assert (EXPERT, *RECIPES) == NAMES
 
 
 @pytest.mark.parametrize("name", RECIPES)
 def test_a_recipe_gives_clips_with_finite_labels_that_depend_on_the_seed_alone(sim: LiftSim, name: str) -> None:
-    plan = scripted(CONFIG, name, 1, "1")
+    plan = short(CONFIG, name, 1)
     clip = run_episode(sim, CONFIG, plan)
     assert clip.rgb.shape == (3, 64, 64, 3) and clip.rgb.dtype == np.uint8
     assert clip.depth is not None and clip.depth.shape == (3, 64, 64)
@@ -55,10 +59,11 @@ def test_a_recipe_gives_clips_with_finite_labels_that_depend_on_the_seed_alone(s
     assert clip.tracks.shape == (20, 3, 2) and clip.visible.shape == (20, 3)
     assert all(np.isfinite(labels).all() for labels in (clip.depth, clip.actions, clip.tracks))
     assert clip.provenance["expert"]["mode"] == name and clip.provenance["difficulty"] == "difficult"
-    run_episode(sim, CONFIG, scripted(CONFIG, name, GROUP, "other"))
-    again = encode_clip(run_episode(sim, CONFIG, scripted(CONFIG, name, 1, "1")))
+    run_episode(sim, CONFIG, short(CONFIG, name, GROUP))
+    again = encode_clip(run_episode(sim, CONFIG, short(CONFIG, name, 1)))
     np.testing.assert_equal(again, encode_clip(clip))
-    other = run_episode(sim, CONFIG, scripted(replace(CONFIG, seed=6), name, 1, "1"))
+    config = replace(CONFIG, seed=6)
+    other = run_episode(sim, config, short(config, name, 1))
     assert not np.array_equal(other.actions, clip.actions)
     rng = np.random.default_rng([CONFIG.seed, plan.episode])
     assert clip_seed(clip.provenance) == int(rng.integers(2**32))
@@ -77,7 +82,7 @@ def test_a_clip_that_begins_midway_is_the_end_of_the_whole_episode(sim: LiftSim)
 
 
 def test_grasps_of_a_group_share_start_and_approach_and_about_half_succeed(sim: LiftSim) -> None:
-    plans = [scripted(CONFIG, "grasps", place, f"{place}") for place in range(12 * GROUP)]
+    plans = [scripted(CONFIG, "grasps", place, f"{place}") for place in range(6 * GROUP)]
     success = []
     over_the_cube: list[bool] = []
     for first in range(0, len(plans), GROUP):
@@ -92,7 +97,7 @@ def test_grasps_of_a_group_share_start_and_approach_and_about_half_succeed(sim: 
         over_the_cube.append(parted > 5)
         assert over_the_cube[-1] or isinstance(plans[first].manner, MistakenManner)
         success.append(lifted[:, -1])
-    assert 3 <= sum(over_the_cube) <= 9
+    assert 1 <= sum(over_the_cube) <= 5
     rates = np.mean(success, 0)
     assert 0.35 < rates.mean() < 0.65
     assert rates[0] > 0.8 and rates[-1] < 0.4, "the nearest succeed and the farthest fail"
@@ -137,23 +142,6 @@ def test_the_default_keeps_its_episodes_and_another_recipe_has_another_key() -> 
     assert training_plans(CONFIG) == tuple(EpisodePlan(f"{number:06d}", number) for number in range(20))
     assert collection_key(MIX) != collection_key(CONFIG)
     assert collection_key(replace(CONFIG, recipe=("expert",))) == collection_key(CONFIG)
-
-
-def test_a_mix_has_the_test_clips_of_the_expert_and_held_out_contacts(sim: LiftSim, tmp_path: Path) -> None:
-    config = replace(CONFIG, episodes=3, test_episodes=1, frames=2, recipe=("grasps", "driving"))
-    collect(config, tmp_path / "mix", lambda done, total: None, workers=1)
-    store = open_store(tmp_path / "mix")
-    assert store.manifest["modes"].keys() >= {"grasps", "driving"}
-    (test,) = map(store.source("test").__getitem__, range(1))
-    expected = encode_clip(run_episode(sim, replace(config, recipe=(EXPERT,)), EpisodePlan("000002", 2)))
-    for record in (test, expected):
-        record["provenance"].pop("depth_range", None)  # of the training clips
-    np.testing.assert_equal(test, expected)
-    contacts = collect_contacts(config, store, 1, lambda done, total: None, workers=1)
-    assert contacts.splits == contact_splits(config) == tuple(f"contacts_{name}" for name in RECIPES)
-    assert contacts.manifest["depth_range"] == store.manifest["depth_range"]
-    assert [contacts.source(split)[0]["provenance"]["expert"]["mode"] for split in contacts.splits] == list(RECIPES)
-    assert not contact_splits(replace(config, env="metaworld", camera="near", recipe=(EXPERT,)))
 
 
 def test_groups_of_grasps_beside_the_cube_differ_in_height_and_their_episodes_do_not() -> None:

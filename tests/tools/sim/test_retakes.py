@@ -11,7 +11,7 @@ from rsjax.data.store import Store, encode_clip, open_store, write_store
 from rsjax.errors import UserError
 from rsjax.tools.sim import retakes
 from rsjax.tools.sim.collect import Collection, Report
-from rsjax.tools.sim.episode import EpisodePlan, Replay, run_episode, source_name
+from rsjax.tools.sim.episode import EpisodePlan, run_episode, source_name
 from rsjax.tools.sim.lift import LiftSim
 from rsjax.tools.sim.recipes.plans import scripted
 from rsjax.tools.sim.retakes import collect_retakes
@@ -40,13 +40,6 @@ def store(sim: LiftSim, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Stor
 
     monkeypatch.setattr(retakes, "make_store", make)
     return open_store(tmp_path / "lift")
-
-
-def test_a_replay_without_jitter_is_the_clip(sim: LiftSim) -> None:
-    clip = run_episode(sim, CONFIG, EpisodePlan("1", 1))
-    again = run_episode(sim, CONFIG, EpisodePlan("1", 1, replay=Replay(clip.actions, 0.0)))
-    for name in ("rgb", "depth", "actions", "tracks", "success"):
-        np.testing.assert_array_equal(getattr(again, name), getattr(clip, name), err_msg=name)
 
 
 def test_second_takes_start_alike_and_move_a_little_otherwise(store: Store) -> None:

@@ -50,10 +50,6 @@ def test_every_annotator_can_be_pickled_and_its_parameters_written_as_json(annot
     assert params["name"] == annotator.name and params["version"] == annotator.version
 
 
-def test_names_differ():
-    assert len({annotator.name for annotator in ALL}) == len(ALL)
-
-
 def test_parameters_depend_on_weights_and_not_on_the_device(tmp_path):
     (tmp_path / "a").mkdir()
     (tmp_path / "b").mkdir()

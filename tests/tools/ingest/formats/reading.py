@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from rsjax.errors import UserError
-from rsjax.tools.ingest.episode import Episode, EpisodeError, SourceError
+from rsjax.tools.ingest.episode import Episode
 from rsjax.tools.ingest.formats import open_source
 
 
@@ -21,32 +21,21 @@ def read_first(name: str, path: Path, **options: Any) -> Episode:
     return source.read(pickle.loads(pickle.dumps(next(source.episodes()))))
 
 
-def error_of(name: str, path: Path, number: int = 0, **options: Any) -> str:
-    """Returns the message of the one episode that cannot be read."""
-    source = open_source(name, path, **options)
-    messages = {}
-    for place, ref in enumerate(source.episodes()):
-        try:
-            source.read(ref)
-        except EpisodeError as error:
-            messages[place] = str(error)
-    assert list(messages) == [number], messages
-    assert "\n" not in messages[number]
-    return messages[number]
-
-
-def failures(name: str, path: Path, **options: Any) -> list[UserError]:
-    """Returns every error of opening a data set, and of reading its episodes, pictures and depth maps."""
+def read_everything(name: str, path: Path, **options: Any) -> tuple[int, list[UserError]]:
+    """Returns how many episodes are listed, and all errors, of pictures and depth maps too; each is one line."""
+    listed = 0
     errors: list[UserError] = []
     try:
         source = open_source(name, path, **options)
         for ref in source.episodes():
+            listed += 1
             try:
                 episode = source.read(ref)
                 for pictures in (*episode.cameras.values(), *episode.depth.values()):
                     pictures.read([0, len(pictures) - 1])
-            except EpisodeError as error:
+            except UserError as error:
                 errors.append(error)
-    except SourceError as error:
+    except UserError as error:
         errors.append(error)
-    return errors
+    assert not any("\n" in str(error) for error in errors)
+    return listed, errors

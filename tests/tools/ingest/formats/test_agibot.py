@@ -57,16 +57,6 @@ def info(episode: str = EPISODE) -> dict[str, Any]:
     return entry | {"label_info": {"action_config": config}}
 
 
-def write_h5(root: Path, edit: Edit = lambda made: None) -> Path:
-    path = root / f"proprio_stats/{TASK}/{EPISODE}/proprio_stats.h5"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    edit(made := arrays())
-    with h5py.File(path, "w") as file:
-        for name, array in made.items():
-            file[name] = array
-    return path
-
-
 def write_agibot(root: Path, edit: Edit = lambda made: None) -> Path:
     place = root / f"observations/{TASK}/{EPISODE}"
     for camera in ("head", "hand_left", "hand_right"):
@@ -74,7 +64,11 @@ def write_agibot(root: Path, edit: Edit = lambda made: None) -> Path:
     (place / "depth").mkdir()
     for number in range(COUNT):
         cv2.imwrite(str(place / f"depth/head_depth_{number:06d}.png"), np.full((4, 6), 500 + number, np.uint16))
-    write_h5(root, edit)
+    edit(made := arrays())
+    (root / f"proprio_stats/{TASK}/{EPISODE}").mkdir(parents=True)
+    with h5py.File(root / f"proprio_stats/{TASK}/{EPISODE}/proprio_stats.h5", "w") as file:
+        for name, array in made.items():
+            file[name] = array
     (root / "task_info").mkdir()
     (root / f"task_info/task_{TASK}.json").write_text(json.dumps([info()]))
     return root
@@ -105,6 +99,8 @@ def test_a_whole_episode(tmp_path: Path) -> None:
     assert episode.meta["scene"] == "a table"
     assert not episode.meta["notes"].get("scattered")
     json.dumps(episode.meta)
+    one = read_first("agibot", tmp_path, cameras=["hand_left"])
+    assert (list(one.cameras), one.depth) == (["hand_left"], {})
 
 
 def test_commands_that_copy_the_state_tell_how_the_arm_came_there(tmp_path: Path) -> None:
@@ -142,47 +138,27 @@ def test_fewer_commands_than_frames_are_put_where_they_were_sent(tmp_path: Path,
     assert episode.meta["notes"]["scattered"] == {"end/position": 3, "end/orientation": 3, "effector/position": 3}
 
 
-def test_flipped_quaternions_are_turned_back(tmp_path: Path) -> None:
-    def flip(made: dict[str, Any]) -> None:
+def test_what_is_mended_is_noted(tmp_path: Path) -> None:
+    def edit(made: dict[str, Any]) -> None:
         made["action/end/orientation"][3:5, 0] *= -1
         made["state/end/orientation"][2, 1] *= -1
-
-    episode = read_first("agibot", write_agibot(tmp_path, flip))
-    np.testing.assert_allclose(episode.actions[1:, 6:14], turning(COUNT, 0.1)[:-1].reshape(-1, 8), atol=1e-6)
-    assert episode.states is not None
-    np.testing.assert_allclose(episode.states[:, 6:14], turning(COUNT).reshape(-1, 8), atol=1e-6)
-    assert episode.meta["notes"]["flipped"] == {"action/end/orientation": 2, "state/end/orientation": 1}
-
-
-def test_an_episode_that_task_info_does_not_name_has_no_task_and_says_so(tmp_path: Path) -> None:
-    root = write_agibot(tmp_path)
-    (root / "task_info/task_327.json").write_text("[]")
-    episode = read_first("agibot", root)
-    assert (episode.task, episode.segments) == ("", ())
-    assert episode.meta["notes"]["task_info"] == "names no such episode, so it has no task"
-
-
-def test_empty_fields_are_zeros_and_noted(tmp_path: Path) -> None:
-    def empty(made: dict[str, Any]) -> None:
         made["action/effector/position"] = np.zeros((0, 2))
         made["state/waist/position"] = np.zeros(0)
         del made["state/head/position"]
 
-    episode = read_first("agibot", write_agibot(tmp_path, empty))
-    assert not episode.actions[:, 14:].any()
-    assert episode.states is not None
-    assert not episode.states[:, 30:].any()
-    fields = ["state/head/position", "state/waist/position", "action/effector/position"]
-    assert sorted(episode.meta["notes"]["empty"]) == sorted(fields)
-
-
-def test_incomplete_depth_is_left_out_and_noted(tmp_path: Path) -> None:
-    root = write_agibot(tmp_path)
+    root = write_agibot(tmp_path, edit)
+    (root / "task_info/task_327.json").write_text("[]")
     (root / f"observations/{TASK}/{EPISODE}/depth/head_depth_000003.png").unlink()
     episode = read_first("agibot", root)
-    assert not episode.depth
-    assert episode.meta["notes"]["depth_left_out"] == "7 depth maps for 8 frames"
-    assert read_first("agibot", root, cameras=["hand_left"]).depth == {}
+    np.testing.assert_allclose(episode.actions[1:, 6:14], turning(COUNT, 0.1)[:-1].reshape(-1, 8), atol=1e-6)
+    np.testing.assert_allclose(np.asarray(episode.states)[:, 6:14], turning(COUNT).reshape(-1, 8), atol=1e-6)
+    assert not episode.actions[:, 14:].any() and not np.asarray(episode.states)[:, 30:].any()
+    assert (episode.task, episode.segments, episode.depth) == ("", (), {})
+    notes = episode.meta["notes"]
+    assert notes["flipped"] == {"action/end/orientation": 2, "state/end/orientation": 1}
+    assert {*notes["empty"]} == {"state/head/position", "state/waist/position", "action/effector/position"}
+    assert notes["task_info"] == "names no such episode, so it has no task"
+    assert notes["depth_left_out"] == "7 depth maps for 8 frames"
 
 
 def test_depth_that_is_unpacked_later_makes_another_episode(tmp_path: Path) -> None:

@@ -70,12 +70,6 @@ def test_bad_lines_do_not_end_the_file(tmp_path: Path) -> None:
         list(json_lines(tmp_path / "gone"))
 
 
-def test_unknown_formats_are_reported(tmp_path: Path) -> None:
-    with pytest.raises(SourceError, match="unknown format 'lerobo'; did you mean 'lerobot'"):
-        open_source("lerobo", tmp_path)
-    assert len(set(FORMATS)) == len(FORMATS)
-
-
 @pytest.mark.parametrize(
     ("name", "options", "message"),
     [
@@ -101,11 +95,6 @@ def test_every_format_can_be_opened(tmp_path: Path, name: str) -> None:
     for options, place, message in (({"nonsense": 1}, "", "no option 'nonsense'"), ({}, "gone", "gone: not there")):
         with pytest.raises(SourceError, match=message):
             open_source(name, tmp_path / place, **options)
-
-
-def test_times_that_count_from_1970_keep_their_intervals() -> None:
-    table = pa.table({"t": 1.7e9 + np.arange(4) / 30})
-    np.testing.assert_allclose(np.diff(seconds(table, "t", "f")), 1 / 30, atol=1e-6)
 
 
 def test_columns_of_no_numbers_and_files_that_unpack_to_gigabytes_are_refused(tmp_path: Path) -> None:

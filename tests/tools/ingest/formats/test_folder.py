@@ -1,5 +1,4 @@
 import json
-import os
 from pathlib import Path
 
 import cv2
@@ -8,11 +7,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from rsjax.data.codec import decode, encode
 from rsjax.tools.ingest.actions import ActionConfig, ActionLayout, sampled_actions
 from rsjax.tools.ingest.episode import Episode, EpisodeError
 from rsjax.tools.ingest.formats import open_source
-from tests.tools.ingest.formats.reading import error_of, read_all, read_first
+from tests.tools.ingest.formats.reading import read_all, read_everything, read_first
 from tests.tools.ingest.formats.videos import numbers_of, picture, write_video
 
 COUNT = 8
@@ -30,16 +28,6 @@ def write_episode(root: Path, name: str = "one") -> Path:
     write_video(root / name / "wrist.mp4", range(20, 20 + COUNT), 10)
     write_csv(root / name / "actions.csv")
     return root / name
-
-
-def test_a_name_that_is_no_text_is_kept(tmp_path: Path) -> None:
-    name = os.fsdecode(b"caf\xe9")
-    write_episode(tmp_path, name)
-    (episode,) = read_all("folder", tmp_path)
-    assert episode.id.isascii() or episode.id == name
-    assert decode(encode({"id": episode.id, "n": np.zeros(1)}))["id"] == episode.id
-    write_episode(tmp_path, os.fsdecode(b"caf\xea"))
-    assert len({episode.id for episode in read_all("folder", tmp_path)}) == 2
 
 
 def test_an_episode_in_a_folder(tmp_path: Path) -> None:
@@ -95,14 +83,13 @@ def test_pictures_and_depth_maps(tmp_path: Path) -> None:
         cv2.imwrite(str(tmp_path / f"one/top/{number}.png"), picture(number)[..., ::-1])
         cv2.imwrite(str(tmp_path / f"one/top.depth/{number}.png"), np.full((4, 6), 1000 + number, np.uint16))
     np.save(tmp_path / "one/actions.npy", np.zeros((12, 3)))
-    assert "how fast are its pictures" in error_of("folder", tmp_path)
+    (error,) = read_everything("folder", tmp_path)[1]
+    assert "how fast are its pictures" in str(error)
     (episode,) = read_all("folder", tmp_path, fps=5)
     assert numbers_of(episode.cameras["top"].read([11, 2])) == [11, 2]
     depth = episode.depth["top"].read([10, 0])
     assert (depth.dtype, depth.shape) == (np.float32, (2, 4, 6))
     np.testing.assert_allclose(depth[:, 0, 0], [1.01, 1.0])
-    (tmp_path / "one/top.depth/5.png").unlink()
-    assert "depth top has 11 rows, timestamps 12" in error_of("folder", tmp_path, fps=5)
 
 
 def test_links_that_lead_to_themselves(tmp_path: Path) -> None:
@@ -113,9 +100,6 @@ def test_links_that_lead_to_themselves(tmp_path: Path) -> None:
     assert (loop.id, one.id) == ("loop", "one")
     with pytest.raises(EpisodeError, match=r"loop: cannot be listed \(Too many levels of symbolic links\)"):
         source.read(loop)
-    (tmp_path / "loop").unlink()
-    (tmp_path / "one/loop.mp4").symlink_to(tmp_path / "one/loop.mp4")
-    assert "loop.mp4: not a readable video (Too many levels of symbolic links)" in error_of("folder", tmp_path)
 
 
 def sampled(episode: Episode, step: int) -> np.ndarray:
@@ -157,7 +141,8 @@ def test_cameras_that_drift_apart_are_reported(tmp_path: Path) -> None:
     for name, fps in (("front", 10), ("wrist", 5)):
         write_video(tmp_path / f"one/{name}.mp4", range(COUNT), fps)
     np.save(tmp_path / "one/actions.npy", ACTIONS)
-    assert "wrist: its frame 7 is shown 0.7 s away from that of front; give" in error_of("folder", tmp_path)
+    (error,) = read_everything("folder", tmp_path)[1]
+    assert "wrist: its frame 7 is shown 0.7 s away from that of front; give" in str(error)
     (episode,) = read_all("folder", tmp_path, fps=10)
     np.testing.assert_allclose(episode.timestamps, np.arange(COUNT) / 10)
 

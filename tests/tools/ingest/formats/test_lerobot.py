@@ -10,7 +10,7 @@ import pytest
 
 from rsjax.tools.ingest.episode import EpisodeError
 from rsjax.tools.ingest.formats import open_source
-from tests.tools.ingest.formats.reading import read_all
+from tests.tools.ingest.formats.reading import read_all, read_first
 from tests.tools.ingest.formats.videos import numbers_of, picture, write_video
 
 LENGTHS = (6, 9, 5)
@@ -55,7 +55,7 @@ def rows(episode: int, first: int) -> dict[str, Any]:
     }
 
 
-def write_v2(root: Path, codec: str = "libx264") -> Path:
+def write_v2(root: Path) -> Path:
     write_info(root, "v2.1", V2_PATHS)
     (root / "meta/tasks.jsonl").write_text(
         "".join(json.dumps({"task_index": i, "task": task}) + "\n" for i, task in enumerate(TASKS))
@@ -67,14 +67,14 @@ def write_v2(root: Path, codec: str = "libx264") -> Path:
         table.parent.mkdir(parents=True, exist_ok=True)
         pq.write_table(pa.table(rows(episode, first)), table)
         numbers = range(first, first + LENGTHS[episode])
-        write_video(root / "videos" / folder / KEY / f"episode_{episode:06d}.mp4", numbers, FPS, codec)
+        write_video(root / "videos" / folder / KEY / f"episode_{episode:06d}.mp4", numbers, FPS)
         tasks = list(TASKS[: 1 if episode < 2 else 2])
         lines.append(json.dumps({"episode_index": episode, "tasks": tasks, "length": LENGTHS[episode]}))
     (root / "meta/episodes.jsonl").write_text("\n".join(lines) + "\n")
     return root
 
 
-def write_v3(root: Path, codec: str = "libx264") -> Path:
+def write_v3(root: Path) -> Path:
     """Episodes 0 and 1 share a table and a video, episode 2 has its own."""
     write_info(root, "v3.0", V3_PATHS)
     tables = [pa.table(rows(episode, first)) for episode, first in enumerate((0, 6, 15))]
@@ -82,7 +82,7 @@ def write_v3(root: Path, codec: str = "libx264") -> Path:
     pq.write_table(pa.concat_tables(tables[:2]), root / "data/chunk-000/file-000.parquet")
     pq.write_table(tables[2], root / "data/chunk-000/file-001.parquet")
     for file, numbers in enumerate((range(15), range(15, 20))):
-        write_video(root / f"videos/{KEY}/chunk-000/file-{file:03d}.mp4", numbers, FPS, codec)
+        write_video(root / f"videos/{KEY}/chunk-000/file-{file:03d}.mp4", numbers, FPS)
     meta = {
         "episode_index": [0, 1, 2],
         "tasks": [["pick"], ["pick"], ["pick", "place"]],
@@ -104,84 +104,52 @@ def write_v3(root: Path, codec: str = "libx264") -> Path:
     return root
 
 
-WRITERS = {"v2.1": write_v2, "v3.0": write_v3}
-
-
-@pytest.mark.parametrize("version", WRITERS)
-def test_every_picture_action_and_state_is_where_it_belongs(tmp_path: Path, version: str) -> None:
-    episodes = read_all("lerobot", WRITERS[version](tmp_path))
-    for episode, (number, first) in zip(episodes, enumerate((0, 6, 15)), strict=True):
+def test_every_picture_action_and_state_is_where_it_belongs_in_both_versions(tmp_path: Path) -> None:
+    versions = [read_all("lerobot", write(tmp_path / write.__name__)) for write in (write_v2, write_v3)]
+    for number, pair in enumerate(zip(*versions, strict=True)):
+        first = (0, 6, 15)[number]
         count = LENGTHS[number]
-        assert episode.id == f"episode_{number:06d}"
-        assert list(episode.cameras) == ["top"]
-        assert numbers_of(episode.cameras["top"].read(range(count))) == list(range(first, first + count))
-        np.testing.assert_allclose(episode.timestamps, np.arange(count) / FPS, atol=1e-6)
-        # the action of row t - 1 led into frame t
-        np.testing.assert_array_equal(episode.actions[1:, 0], np.arange(count - 1))
-        np.testing.assert_array_equal(episode.actions[1:, 1], number)
-        assert not episode.actions[0].any()
-        assert episode.states is not None
-        np.testing.assert_array_equal(episode.states[:, 0], np.arange(count) + 0.5)
-        assert (episode.fps, episode.task) == (FPS, "pick" if number < 2 else "pick; place")
-        assert [(s.start, s.end, s.text) for s in episode.segments] == (
-            [] if number < 2 else [(0, 2, "pick"), (2, 5, "place")]
-        )
-        json.dumps(episode.meta)
+        for episode in pair:
+            assert episode.id == f"episode_{number:06d}"
+            assert list(episode.cameras) == ["top"]
+            assert numbers_of(episode.cameras["top"].read(range(count))) == list(range(first, first + count))
+            np.testing.assert_allclose(episode.timestamps, np.arange(count) / FPS, atol=1e-6)
+            # the action of row t - 1 led into frame t
+            np.testing.assert_array_equal(episode.actions[1:, 0], np.arange(count - 1))
+            np.testing.assert_array_equal(episode.actions[1:, 1], number)
+            assert not episode.actions[0].any()
+            np.testing.assert_array_equal(np.asarray(episode.states)[:, 0], np.arange(count) + 0.5)
+            assert (episode.fps, episode.task) == (FPS, "pick" if number < 2 else "pick; place")
+            segments = [(s.start, s.end, s.text) for s in episode.segments]
+            assert segments == ([] if number < 2 else [(0, 2, "pick"), (2, 5, "place")])
+            assert json.loads(json.dumps(episode.meta)) == pair[0].meta
 
 
-@pytest.mark.parametrize("version", WRITERS)
-def test_av1(tmp_path: Path, version: str) -> None:
-    episode = read_all("lerobot", WRITERS[version](tmp_path, "libsvtav1"))[1]
-    assert numbers_of(episode.cameras["top"].read([8, 0, 3])) == [14, 6, 9]
-
-
-def misname(root: Path) -> Path:
-    """Names the first table for the first episode of the second, as LeRobot's converter to v3 does."""
-    path = root / "meta/episodes/chunk-000/file-000.parquet"
-    table = pq.read_table(path)
-    place = table.column_names.index("data/file_index")
-    pq.write_table(table.set_column(place, "data/file_index", pa.array([0, 0, 0])), path)
-    return root
-
-
-def test_rows_are_searched_where_the_metadata_name_the_file_before(tmp_path: Path) -> None:
-    ours = read_all("lerobot", misname(write_v3(tmp_path / "misnamed")))
-    for episode, other in zip(ours, read_all("lerobot", write_v3(tmp_path / "v3")), strict=True):
+def test_rows_are_searched_where_the_metadata_are_wrong(tmp_path: Path) -> None:
+    """LeRobot's converter to v3 names the first table for the first episode of the second."""
+    root = write_v3(tmp_path)
+    expected = read_all("lerobot", root)
+    meta = root / "meta/episodes/chunk-000/file-000.parquet"
+    table = pq.read_table(meta)
+    for column, values in (("data/file_index", [0, 0, 0]), ("dataset_from_index", [0, 5, 15])):
+        table = table.set_column(table.column_names.index(column), column, pa.array(values))
+    pq.write_table(table, meta)
+    found = read_all("lerobot", root)
+    notes = [episode.meta.get("notes") for episode in found]
+    assert notes == [None, {"range": "rows 6 … 15, where the metadata say 5 … 15"}, None]
+    for episode, other in zip(found, expected, strict=True):
         np.testing.assert_array_equal(episode.actions, other.actions)
         numbers = [numbers_of(each.cameras["top"].read(range(len(each.actions)))) for each in (episode, other)]
         assert numbers[0] == numbers[1]
-
-
-def test_a_range_that_the_metadata_have_wrong_is_noted(tmp_path: Path) -> None:
-    root = write_v3(tmp_path)
-    meta = root / "meta/episodes/chunk-000/file-000.parquet"
-    table = pq.read_table(meta)
-    place = table.column_names.index("dataset_from_index")
-    pq.write_table(table.set_column(place, "dataset_from_index", pa.array([0, 5, 15])), meta)
-    notes = [episode.meta.get("notes") for episode in read_all("lerobot", root)]
-    assert notes == [None, {"range": "rows 6 … 15, where the metadata say 5 … 15"}, None]
-
-
-def test_rows_are_searched_where_the_named_table_is_missing(tmp_path: Path) -> None:
-    root = write_v3(tmp_path)
-    (root / "data/chunk-000/file-000.parquet").rename(root / "data/chunk-000/file-002.parquet")
+    named = root / "data/chunk-000/file-000.parquet"
+    other_name = named.rename(named.with_name("file-002.parquet"))
     assert [len(episode.actions) for episode in read_all("lerobot", root)] == list(LENGTHS)
-
-
-def test_rows_that_no_table_has_are_reported_for_the_named_file(tmp_path: Path) -> None:
-    misname(write_v3(tmp_path))
-    (tmp_path / "data/chunk-000/file-001.parquet").write_bytes(b"damaged")
-    source = open_source("lerobot", tmp_path)
+    other_name.rename(named)
+    (root / "data/chunk-000/file-001.parquet").write_bytes(b"damaged")
+    source = open_source("lerobot", root)
     *_, last = source.episodes()
     with pytest.raises(EpisodeError, match="file-000.parquet: has no row of episode 2, nor has any other"):
         source.read(last)
-
-
-def test_both_versions_give_the_same(tmp_path: Path) -> None:
-    versions = [read_all("lerobot", write(tmp_path / name)) for name, write in WRITERS.items()]
-    for old, new in zip(*versions, strict=True):
-        np.testing.assert_array_equal(old.actions, new.actions)
-        assert (old.task, old.segments, old.meta) == (new.task, new.segments, new.meta)
 
 
 def test_fingerprints_follow_the_content_not_the_place(tmp_path: Path) -> None:
@@ -208,21 +176,35 @@ def test_pictures_in_the_table(tmp_path: Path) -> None:
         path = root / f"data/chunk-{episode // 2:03d}/episode_{episode:06d}.parquet"
         pq.write_table(pa.table(rows(episode, first) | {"observation.image": encoded}), path)
     assert numbers_of(read_all("lerobot", root)[1].cameras["image"].read([8, 1])) == [14, 7]
+    for cells in (["top.png"] * 5, [{"bytes": None, "path": "top.png"}] * 5):
+        pq.write_table(pa.table(rows(2, 15) | {"observation.image": cells}), path)
+        frames = read_all("lerobot", root)[2].cameras["image"]
+        with pytest.raises(EpisodeError, match=r"000002.parquet: observation.image of row 2: has no encoded picture"):
+            frames.read([2])
+
+
+def test_bad_entries_are_counted_not_dropped(tmp_path: Path) -> None:
+    root = write_v2(tmp_path)
+    with (root / "meta/episodes.jsonl").open("a") as file:
+        file.write('{"episode_index": 1, "tasks": [], "length": 9}\n{"episode_index": 7}\n{"episode_ind\n')
+    source = open_source("lerobot", root)
+    refs = list(source.episodes())
+    assert len({ref.id for ref in refs}) == len(refs) == 6
+    for ref, message in zip(refs[3:], ("line 4: .*second time", "line 5: .*'length'", "line 6: .*JSON"), strict=True):
+        with pytest.raises(EpisodeError, match=message):
+            source.read(ref)
 
 
 def test_what_actions_are_is_declared_and_not_guessed(tmp_path: Path) -> None:
     write_v2(tmp_path)
-    (episode, *_) = read_all("lerobot", tmp_path)
+    episode = read_first("lerobot", tmp_path)
     assert episode.meta["actions"]["kind"] == "undeclared" and episode.meta["action_names"] == ["x", "grip"]
-    turns = read_all("lerobot", tmp_path, kind="absolute", angles=[0])[0].meta["actions"]
+    turns = read_first("lerobot", tmp_path, kind="absolute", angles=[0]).meta["actions"]
     assert turns == {"kind": "absolute", "held": [], "quaternions": [], "angles": [0]}
     declared = read_all("lerobot", tmp_path, kind="delta")[1].meta["actions"]
     assert declared["unclear"] == ["dimension 1 (grip) is never anything but 1"]
-    assert read_all("lerobot", tmp_path, kind="delta", held=[1])[1].meta["actions"] == {
-        "kind": "delta",
-        "held": [1],
-        "quaternions": [],
-    }
+    believed = read_first("lerobot", tmp_path, kind="delta", held=[1]).meta["actions"]
+    assert believed == {"kind": "delta", "held": [1], "quaternions": []}
 
 
 def test_success_reward_and_the_end_are_those_of_the_frame_that_an_action_led_to(tmp_path: Path) -> None:
@@ -230,7 +212,7 @@ def test_success_reward_and_the_end_are_those_of_the_frame_that_an_action_led_to
         root = write_v2(tmp_path / name)
         (table,) = (root / "data").glob("*/episode_000000.parquet")
         pq.write_table(pa.table(rows(0, 0) | {f"next.{column}": pa.array(x) for column, x in columns.items()}), table)
-        return read_all("lerobot", root)[0].meta
+        return read_first("lerobot", root).meta
 
     plain = written("plain")
     assert "success" not in plain and "reward" not in plain

@@ -47,14 +47,6 @@ def test_an_action_stands_with_the_frame_that_was_recorded_after_it(tmp_path: Pa
     assert before.task == episode.task == "a"
 
 
-def test_the_same_file_is_one_off_from_robomimic(tmp_path: Path) -> None:
-    path = write_demos(tmp_path / "a.hdf5", {"demo_0": libero_demo() | demo()})
-    rows = []
-    for name in ("robomimic", "libero"):
-        rows.append(read_first(name, path).actions)
-    np.testing.assert_array_equal(rows[1][1:], rows[0][1:] + 1)
-
-
 def test_the_task_is_what_is_said_or_the_name_of_the_file(tmp_path: Path) -> None:
     write_demos(tmp_path / "a_demo.hdf5", {"demo_0": libero_demo()}, problem_info={"language_instruction": "lift it"})
     write_demos(tmp_path / "open_the_drawer_demo.hdf5", {"demo_0": libero_demo()})

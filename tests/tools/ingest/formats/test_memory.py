@@ -2,7 +2,6 @@
 
 import ctypes
 import gc
-import shutil
 from collections.abc import Callable, Iterator
 from itertools import islice
 from pathlib import Path
@@ -17,11 +16,9 @@ import pytest
 from rsjax.data.store import Record, write_store
 from rsjax.tools.ingest.episode import EpisodeRef, EpisodeSource
 from rsjax.tools.ingest.formats import open_source
-from tests.tools.ingest.formats.test_agibot import write_agibot
 from tests.tools.ingest.formats.test_lerobot import V3_PATHS, write_info
 from tests.tools.ingest.formats.toy_demos import write_demos
 from tests.tools.ingest.formats.toy_tfrecord import bridge_episode, write_bridge
-from tests.tools.ingest.formats.videos import close_videos, write_video
 
 EPISODES = 50
 FIRST = 10
@@ -78,24 +75,6 @@ def lerobot(root: Path) -> None:
     pq.write_table(pa.table({"task_index": [0], "task": ["pick"]}), root / "meta/tasks.parquet")
 
 
-def folder(root: Path) -> None:
-    recorded = write_video(root / "video.mp4", range(STEPS), 10, size=(SIDE, SIDE))
-    for number in range(EPISODES):
-        (root / f"episode-{number}").mkdir()
-        np.save(root / f"episode-{number}" / "actions.npy", np.ones((STEPS, 2)))
-        shutil.copy(recorded, root / f"episode-{number}" / "front.mp4")
-    recorded.unlink()
-
-
-def agibot(root: Path) -> None:
-    write_agibot(root / "one")
-    for part in ("observations", "proprio_stats"):
-        for number in range(EPISODES):
-            shutil.copytree(root / "one" / part / "327" / "648642", root / part / "327" / str(number))
-    shutil.rmtree(root / "one")
-    (root / "task_info").mkdir()
-
-
 def sim(root: Path) -> None:
     root.rmdir()
     clip: Record = {
@@ -108,9 +87,7 @@ def sim(root: Path) -> None:
     write_store(root, "clips", {"train": (clip for _ in range(EPISODES))}, {})
 
 
-WRITERS: dict[str, Callable[[Path], None]] = {
-    writer.__name__: writer for writer in (agibot, lerobot, robomimic, rlds, folder, sim)
-}
+WRITERS: dict[str, Callable[[Path], None]] = {writer.__name__: writer for writer in (lerobot, robomimic, rlds, sim)}
 
 
 def peak() -> int:
@@ -140,7 +117,6 @@ def cost(source: EpisodeSource, episodes: int) -> int:
     forget()
     before = peak()
     read_all(source, islice(source.episodes(), episodes))
-    close_videos()
     return peak() - before
 
 

@@ -12,12 +12,7 @@ from rsjax.tools.ingest.episode import EpisodeError
 from rsjax.tools.ingest.formats import open_source
 from tests.bridge import BRIDGE, needs_bridge
 from tests.tools.ingest.formats.reading import read_first
-from tests.tools.ingest.formats.toy_tfrecord import (
-    bridge_episode,
-    step,
-    write_bridge,
-    write_records,
-)
+from tests.tools.ingest.formats.toy_tfrecord import bridge_episode, step, write_bridge, write_records
 
 
 def test_an_action_stands_with_the_frame_that_it_led_into(tmp_path: Path) -> None:
@@ -33,11 +28,7 @@ def test_an_action_stands_with_the_frame_that_it_led_into(tmp_path: Path) -> Non
     np.testing.assert_allclose(episode.timestamps, np.arange(5) / 5)
     assert (episode.task, episode.fps, episode.segments) == ("put it down", 5.0, ())
     assert episode.meta["episode"] == {"episode_id": 3}
-
-
-def test_placeholder_cameras_are_left_out_and_named(tmp_path: Path) -> None:
-    write_bridge(tmp_path, [bridge_episode()])
-    episode = read_first("rlds", tmp_path)
+    # the other cameras are placeholders
     assert list(episode.cameras) == ["image_0"] and episode.meta["blank"] == ["image_1", "image_2", "image_3"]
 
 
@@ -65,13 +56,8 @@ def test_text_as_numbers_is_read(tmp_path: Path) -> None:
     assert read_first("rlds", tmp_path).task == "go"
 
 
-def test_shards_that_are_missing_are_one_entry_that_is_refused(tmp_path: Path) -> None:
-    for number in (0, 2):
-        shard = write_records(tmp_path / f"kitchen-train.tfrecord-{number:05d}-of-00004", [bridge_episode()])
-    source = open_source("rlds", tmp_path, keys="bridge")
-    *good, bad = source.episodes()
-    assert [len(source.read(ref).timestamps) for ref in good] == [5, 5]
-    assert bad.id not in {ref.id for ref in good}
+def test_one_shard_of_several_is_read_alone(tmp_path: Path) -> None:
+    shard = write_records(tmp_path / "kitchen-train.tfrecord-00002-of-00004", [bridge_episode()])
     assert len(list(open_source("rlds", shard, keys="bridge").episodes())) == 1
 
 
@@ -86,7 +72,7 @@ def test_a_shard_that_cannot_be_opened_leaves_the_others(tmp_path: Path) -> None
         source.read(bad)
 
 
-@settings(max_examples=60)
+@settings(max_examples=40)
 @given(st.data())
 def test_damage_that_no_checksum_shows_is_refused_or_harmless(
     tmp_path_factory: pytest.TempPathFactory, data: st.DataObject

@@ -27,21 +27,15 @@ from tests.tools.ingest.formats.toy_tfrecord import (
 )
 
 
-def test_a_key_map_of_ones_own(tmp_path: Path) -> None:
+def test_a_key_map_of_ones_own_says_what_actions_are_or_leaves_them_undeclared(tmp_path: Path) -> None:
     write_bridge(tmp_path / "data", [bridge_episode()])
-    keys = {"cameras": {"front": "observation/image_0"}, "action": ["action"], "fps": 2, "after": True}
-    (tmp_path / "map.json").write_text(json.dumps(keys))
-    episode = read_first("rlds", tmp_path / "data", keys=str(tmp_path / "map.json"))
-    assert list(episode.cameras) == ["front"] and episode.fps == 2 and episode.states is None
-    np.testing.assert_array_equal(episode.actions[:, 0], [1, 2, 3, 4, 5])  # recorded with the frame they led into
-
-
-def test_a_key_map_that_does_not_say_what_actions_are_leaves_them_undeclared(tmp_path: Path) -> None:
-    write_bridge(tmp_path / "data", [bridge_episode()])
-    keys: dict[str, Any] = {"cameras": {"a": "observation/image_0"}, "action": ["action"], "fps": 2}
-    for more, kind in (({}, "undeclared"), ({"kind": "delta", "held": []}, "delta")):
+    keys: dict[str, Any] = {"cameras": {"front": "observation/image_0"}, "action": ["action"], "fps": 2}
+    # Action t of the file is t + 1 and leads into the next frame; with "after", it led into its own.
+    for more, kind, first in (({}, "undeclared", 0), ({"kind": "delta", "held": [], "after": True}, "delta", 1)):
         (tmp_path / "map.json").write_text(json.dumps(keys | more))
         episode = read_first("rlds", tmp_path / "data", keys=str(tmp_path / "map.json"))
+        assert list(episode.cameras) == ["front"] and episode.fps == 2 and episode.states is None
+        np.testing.assert_array_equal(episode.actions[:, 0], first + np.arange(5))
         assert episode.meta["actions"]["kind"] == kind
 
 
@@ -82,14 +76,8 @@ OBSERVED = {
     "eef_pose": tensor(6),
     "clip_embedding": tensor(512),
 }
-
-
 STEPS = {"action": tensor(7), "language_instruction": {"text": {}}, "reward": tensor()}
-
-
 PICTURES = [encoded(picture(step(t))) for t in range(3)]
-
-
 VALUES = {
     "steps/observation/front_rgb": PICTURES,
     "steps/observation/wrist_rgb": PICTURES[::-1],

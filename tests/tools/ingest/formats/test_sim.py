@@ -58,10 +58,11 @@ def test_a_clip_cut_from_a_recording_keeps_its_times(tmp_path: Path) -> None:
 
 def test_the_store_says_what_actions_are_and_whether_success_is_known(tmp_path: Path) -> None:
     lines = ["x (absolute)", "yaw (absolute, an angle)", *["grip (held)"] * 12]
-    path = write(tmp_path / "store", clip(provenance={}), action_dimensions=lines, success_share=None)
-    meta = read_first("sim", path).meta
+    path = write(tmp_path / "store", clip(provenance={}, depth=None), action_dimensions=lines, success_share=None)
+    episode = read_first("sim", path)
+    meta = episode.meta
     layout = {"kind": "absolute", "held": list(range(2, 14)), "quaternions": [], "angles": [1]}
-    assert meta["actions"] == layout and "success" not in meta
+    assert meta["actions"] == layout and "success" not in meta and episode.depth == {}
     declared = read_first("sim", path, held=[]).meta["actions"]
     assert declared == {"kind": "undeclared", "held": [], "quaternions": []}
 
@@ -71,7 +72,3 @@ def test_clips_of_one_episode_are_of_one_recording(tmp_path: Path) -> None:
     source = open_source("sim", write(tmp_path / "store", *clips, clip(provenance={})))
     recordings = [ref.location.get("recording") for ref in source.episodes()]
     assert recordings == ["train-a", "test-a", "test-b", "test-b", None]
-
-
-def test_a_clip_without_depth_has_none(tmp_path: Path) -> None:
-    assert read_first("sim", write(tmp_path / "store", clip(depth=None))).depth == {}

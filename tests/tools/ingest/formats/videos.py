@@ -1,6 +1,6 @@
 """Videos whose pictures say their number, for the tests of formats."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -34,26 +34,18 @@ def write_video(
     codec: str = "libx264",
     size: tuple[int, int] = SIZE,
     rotation: int = 0,
-    options: Mapping[str, str] | None = None,
 ) -> Path:
-    """An MP4 of these pictures with a key frame every 5; its folder is made. ``options`` are the codec's."""
-    return write_pictures(path, [picture(number, size) for number in numbers], fps, codec, rotation, options)
+    """An MP4 of these pictures with a key frame every 5; its folder is made."""
+    return write_pictures(path, [picture(number, size) for number in numbers], fps, codec, rotation)
 
 
 def write_pictures(
-    path: Path,
-    pictures: Sequence[np.ndarray],
-    fps: float = 30,
-    codec: str = "libx264",
-    rotation: int = 0,
-    options: Mapping[str, str] | None = None,
+    path: Path, pictures: Sequence[np.ndarray], fps: float = 30, codec: str = "libx264", rotation: int = 0
 ) -> Path:
     """Any pictures (H, W, 3), as :func:`write_video` writes its own."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with av.open(str(path), "w", format="mp4") as container:
-        stream: Any = container.add_stream(
-            codec, rate=Fraction(fps).limit_denominator(1000), options=_OPTIONS[codec] | dict(options or {})
-        )
+        stream: Any = container.add_stream(codec, rate=Fraction(fps).limit_denominator(1000), options=_OPTIONS[codec])
         stream.height, stream.width, stream.pix_fmt = *pictures[0].shape[:2], "yuv420p"
         stream.codec_context.gop_size = 5
         if rotation:

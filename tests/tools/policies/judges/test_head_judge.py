@@ -1,4 +1,4 @@
-"""The judge of a model's own success head, successes in a row, and how whole clips are judged."""
+"""The judge of a model's own success head, and how whole clips are judged."""
 
 import json
 from dataclasses import replace
@@ -15,15 +15,14 @@ from rsjax.errors import UserError
 from rsjax.files import write_json
 from rsjax.models.base import TeacherForced
 from rsjax.tools.policies.judges.head_judge import HeadJudge, frames_in_a_row, head_judge
-from rsjax.tools.policies.judges.judge import FAIL, HISTORY, SUCCESS, all_successes, frames_of
+from rsjax.tools.policies.judges.judge import FAIL, SUCCESS, all_successes
 from rsjax.tools.policies.judges.judge_training import head_validation
-from rsjax.tools.policies.judges.trained_judge import Footage, TrainedJudge, load_judge
+from rsjax.tools.policies.judges.trained_judge import Footage
 from rsjax.tools.policies.judges.validation import outcomes, validate, whole_clips
 from rsjax.tools.policies.run_data import RunData
 from rsjax.tools.policies.worlds.model_world import FirstFrame, ModelWorld
 from tests.tools.pipeline import toy
 from tests.tools.policies.judges.test_judge import footage
-from tests.tools.policies.judges.test_judge import judge as _judge  # noqa: F401 - a fixture
 from tests.tools.policies.toy import CONTROLS, WIDTH, picture
 from tests.tools.policies.toy_worlds import action_range, trained_like
 
@@ -55,19 +54,6 @@ def test_a_head_judges_by_the_last_frames_that_it_read() -> None:
         head_judge(SimpleNamespace(config=toy.config()), Path("runs/a"))  # type: ignore[arg-type]
     assert "runs/a: has no state heads" in str(caught.value)
     assert "--model.state-heads on" in str(caught.value)
-
-
-def test_a_trained_judge_may_ask_for_two_frames_in_a_row(_judge: TrainedJudge, tmp_path: Path) -> None:  # noqa: F811, PT019
-    two = replace(_judge, in_a_row=2)
-    frames = footage(6, 4).rgb
-    last, before = _judge(frames), _judge(frames[:, :-1])
-    expected = np.minimum(last[:, SUCCESS], before[:, SUCCESS])
-    np.testing.assert_allclose(two(frames)[:, SUCCESS], expected, rtol=1e-6)
-    np.testing.assert_allclose(two(frames[:, :1]), _judge(frames[:, :1]), rtol=1e-6)
-    assert (frames_of(_judge), frames_of(two), frames_of(None)) == (HISTORY, HISTORY + 1, HISTORY)
-    two.save(tmp_path)
-    assert load_judge(tmp_path).key == two.key != _judge.key
-    assert load_judge(tmp_path).in_a_row == 2
 
 
 def test_whole_clips_succeed_where_some_frame_does() -> None:

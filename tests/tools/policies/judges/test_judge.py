@@ -5,7 +5,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import jax
 import numpy as np
 import pytest
 
@@ -14,18 +13,12 @@ from rsjax.data.codec import decode, encode
 from rsjax.errors import UserError
 from rsjax.tools.policies.judges import judge_training as judging
 from rsjax.tools.policies.judges import trained_judge as judge_module
-from rsjax.tools.policies.judges.judge import HISTORY, LABELS, last_frames
+from rsjax.tools.policies.judges.judge import HISTORY, LABELS, SUCCESS, frames_of, last_frames
 from rsjax.tools.policies.judges.people_and_vlms import HumanJudge, LanguageJudge, answer_label, write_blinded
-from rsjax.tools.policies.judges.trained_judge import (
-    Footage,
-    JudgeNetwork,
-    TrainedJudge,
-    corrupted,
-    load_judge,
-    train_judge,
-)
+from rsjax.tools.policies.judges.trained_judge import Footage, TrainedJudge, corrupted, load_judge, train_judge
 from rsjax.tools.policies.judges.validation import confusion_table, markdown, scores, summary, validate
 from tests.tools.pipeline import toy
+from tests.tools.policies.toy_worlds import untrained_judge
 
 
 def footage(videos: int, seed: int) -> Footage:
@@ -122,6 +115,19 @@ def test_a_judge_of_impossible_content_is_refused(judge: TrainedJudge, tmp_path:
     assert load_judge(folder).validation is not None
 
 
+def test_a_trained_judge_may_ask_for_two_frames_in_a_row(judge: TrainedJudge, tmp_path: Path) -> None:
+    two = replace(judge, in_a_row=2)
+    frames = footage(2, 3).rgb
+    expected = np.minimum(judge(frames)[:, SUCCESS], judge(frames[:, :-1])[:, SUCCESS])
+    np.testing.assert_allclose(two(frames)[:, SUCCESS], expected, rtol=1e-6)
+    np.testing.assert_allclose(two(frames[:, :1]), judge(frames[:, :1]), rtol=1e-6)
+    assert (frames_of(judge), frames_of(two), frames_of(None)) == (HISTORY, HISTORY + 1, HISTORY)
+    two.save(tmp_path)
+    loaded = load_judge(tmp_path)
+    assert loaded.key == two.key != judge.key
+    assert loaded.in_a_row == 2
+
+
 def test_histories_end_with_their_frame() -> None:
     some = footage(2, 0)
     np.testing.assert_array_equal(
@@ -177,9 +183,7 @@ def test_a_runs_judge_is_made_and_saved(tmp_path: Path, monkeypatch: pytest.Monk
     def generate(params: Any, assets: Any, prompt: Video, actions: np.ndarray, **options: Any) -> Video:
         return Video(prompt.rgb.repeat(actions.shape[1], 1))
 
-    judge = TrainedJudge(
-        jax.jit(JudgeNetwork().init)(jax.random.key(0), np.zeros((1, HISTORY, 64, 64, 3), np.uint8))["params"], 2.0, 64
-    )
+    judge = untrained_judge(64, temperature=2.0)
     run, store = tmp_path / "run", toy.store(tmp_path / "clips")
     model = SimpleNamespace(generate=generate, reconstruct=lambda assets, video: video)
     trained = SimpleNamespace(config=toy.config(), model=model, params=None, assets=None)

@@ -31,6 +31,9 @@ from tests.tools.policies.toy_worlds import ToySimulator
 
 LOW, HIGH = -np.ones(2), np.ones(2)
 GOAL = np.array([0.9, -1.4])
+SEEN = 2  # frames of a prompt
+FUTURE = 3
+CANDIDATES = 2
 
 
 def distance(start: np.ndarray, candidates: np.ndarray) -> np.ndarray:
@@ -104,9 +107,29 @@ def test_held_controls_repeat_and_wrong_energies_are_named() -> None:
 
 
 @pytest.fixture(scope="module")
-def model(tmp_path_factory: pytest.TempPathFactory) -> TrainedModel:
-    store: Store = toy.store(tmp_path_factory.mktemp("plan") / "clips")
-    return toy.trained(store)
+def clips(tmp_path_factory: pytest.TempPathFactory) -> Store:
+    return toy.store(tmp_path_factory.mktemp("plan") / "clips")
+
+
+@pytest.fixture(scope="module")
+def model(clips: Store) -> TrainedModel:
+    return toy.trained(clips)
+
+
+@pytest.fixture(scope="module")
+def summing(clips: Store) -> TrainedModel:
+    """A model with state heads that reads sums of actions."""
+    config = toy.config()
+    assert isinstance(config.model, RoboScapeConfig)
+    departures = replace(config.model.departures, integrate_actions=True)
+    return toy.trained(clips, toy.with_model(config, departures=departures, state_heads=StateHeadsConfig()))
+
+
+def candidates_of(rng: np.random.Generator) -> np.ndarray:
+    """The actions of each candidate, with equal ones in the prompt."""
+    before = rng.normal(0, 0.4, (1, SEEN, 28)).repeat(CANDIDATES, 0)
+    after = rng.normal(0, 0.4, (CANDIDATES, FUTURE, 28))
+    return np.concatenate([before, after], 1).astype(np.float32)
 
 
 def test_a_planner_acts_in_frames_with_and_without_depth() -> None:
@@ -151,20 +174,16 @@ def test_energies_are_scores_of_what_a_model_generates() -> None:
     np.testing.assert_array_equal(given[0], videos)
 
 
-def test_success_is_read_from_the_models_own_head(tmp_path: Path) -> None:
-    clips = toy.store(tmp_path / "clips")
+def test_success_is_read_from_the_models_own_head(model: TrainedModel, summing: TrainedModel) -> None:
     with pytest.raises(UserError) as refused:
-        energies.success(toy.trained(clips))
+        energies.success(model)
     assert "has no state heads" in str(refused.value)
-    model = toy.trained(clips, toy.with_model(toy.config(), state_heads=StateHeadsConfig()))
-    rgb = toy.clip(0).rgb[:2]
-    rows = np.random.default_rng(0).normal(0, 0.4, (2 + 2 * 3, 28)).astype(np.float32)
-    candidates = rows[2:].reshape(2, 3, 28)
-    found = energies.success(model)(RecentFrames(rgb, None, rows[:2]), candidates)
-    actions = np.concatenate([np.repeat(rows[None, :2], 2, 0), candidates], 1)
-    state = model.plan(rgb, actions).state
+    rgb = toy.clip(0).rgb[:SEEN]
+    actions = candidates_of(np.random.default_rng(0))
+    found = energies.success(summing)(RecentFrames(rgb, None, actions[0, :SEEN]), actions[:, SEEN:])
+    state = summing.plan(rgb, actions).state
     assert state is not None
-    np.testing.assert_allclose(found, 1 - state[:, 2:, 0].mean(1), rtol=1e-5)  # after the prompt
+    np.testing.assert_allclose(found, 1 - state[:, SEEN:, 0].mean(1), rtol=1e-5)  # after the prompt
     assert abs(found[0] - found[1]) > 0
 
 
@@ -317,16 +336,11 @@ def test_a_comparison_resumes_and_counts(model: TrainedModel, tmp_path: Path, mo
         compare(replace(model, config=replace(model.config, model=still)), tmp_path, lift(), settings)
 
 
-def test_sums_of_actions_go_on_from_those_before_the_prompt(tmp_path: Path) -> None:
-    clips = toy.store(tmp_path / "clips")
-    config = toy.config()
-    assert isinstance(config.model, RoboScapeConfig)
-    departures = replace(config.model.departures, integrate_actions=True)
-    trained = toy.trained(clips, toy.with_model(config, departures=departures))
+def test_sums_of_actions_go_on_from_those_before_the_prompt(summing: TrainedModel) -> None:
     rng = np.random.default_rng(0)
-    rgb, rows = toy.clip(0).rgb[:1], rng.normal(0, 0.4, (1, 3, 28)).astype(np.float32)
-    inputs = trained.params, trained.assets, Video(rgb[None]), rows
-    model = trained.model
+    rows = candidates_of(rng)
+    inputs = summing.params, summing.assets, Video(toy.clip(0).rgb[None, :SEEN]), rows
+    model = summing.model
     plain = model.plan(*inputs)
     at_rest = model.plan(*inputs, past=np.zeros((5, 28), np.float32))
     np.testing.assert_allclose(at_rest.rgb, plain.rgb, atol=1)
@@ -334,8 +348,8 @@ def test_sums_of_actions_go_on_from_those_before_the_prompt(tmp_path: Path) -> N
     moved = model.plan(*inputs, past=past)
     assert (moved.rgb != plain.rgb).any()
     # It adds the same to all frames after the first, as their positions could.
-    added = past.sum(0) / np.maximum(trained.assets.normalization.action_std, 1e-3) / 4
-    positions = trained.params["pos_embed"].copy()
-    positions[1:] += added.astype(np.float32) @ trained.params["action_encoder"]["kernel"][28:]
-    placed = model.plan(trained.params | {"pos_embed": positions}, *inputs[1:])
+    added = past.sum(0) / np.maximum(summing.assets.normalization.action_std, 1e-3) / 4
+    positions = summing.params["pos_embed"].copy()
+    positions[1:] += added.astype(np.float32) @ summing.params["action_encoder"]["kernel"][28:]
+    placed = model.plan(summing.params | {"pos_embed": positions}, *inputs[1:])
     np.testing.assert_allclose(placed.rgb.astype(int), moved.rgb, atol=1)

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -90,17 +91,18 @@ def test_trainings_that_differ_widen_the_interval_and_one_training_has_that_of_i
     assert wide.value == plain.value and wide.low < 0 < plain.low < plain.high < wide.high  # type: ignore[operator]
 
 
-def test_a_model_that_moves_alike_ranks_alike(tmp_path: Path) -> None:
+def test_models_are_compared_with_the_simulator_and_their_mistakes_are_told_from_other_actions(tmp_path: Path) -> None:
     policies: Any = {f"speed-{speed}": ToyPolicy(speed) for speed in (0.1, 0.8, 0.9, 1.0)}
-    models: Any = {"true": lambda: imagined(5), "slow": lambda: imagined(5, pace=0.5)}
+    paces = {"true": 1.0, "slow": 0.5, "fast": 3.0}
+    models: Any = {name: partial(imagined, 5, pace=pace) for name, pace in paces.items()}
     results = compare(policies, simulated(5), models, TRIALS, tmp_path)
-    same, slow = results["runs"]
+    same, slow, fast = results["runs"]
     assert same["run"] == "true" and same["same_outcome"] == 1
     assert same["pearson"]["value"] == pytest.approx(1) and same["r2_identity"] == same["r2_prediction"] == 1
     assert (same["mmrv"], same["bias"]) == (0, 0)
     assert slow["bias"] < 0 and slow["mmrv"] >= 0 and slow["same_outcome"] < 1
     assert {path.name for path in (tmp_path / "videos").iterdir()} == {
-        f"{run}-{name}-00.mp4" for run in ("true", "slow") for name in policies
+        f"{run}-{name}-00.mp4" for run in models for name in policies
     }
     text = squeezed(tmp_path / "results.md")
     assert "R² of y = x is 1 - Σ(y - x)² / Σ(y - ȳ)²" in text
@@ -108,27 +110,20 @@ def test_a_model_that_moves_alike_ranks_alike(tmp_path: Path) -> None:
     assert all(each["corrected"]["worth"] == 10 for each in same["policies"].values())  # every trial is paired
     assert (tmp_path / "scatter.png").read_bytes().startswith(b"\x89PNG")
     assert json.loads((tmp_path / "results.json").read_text()) == results
-    again = compare(policies, simulated(5), {}, TRIALS, tmp_path)  # nothing is run again
-    assert again["runs"] == []
 
-
-def test_a_replay_tells_what_the_model_mistakes_from_what_the_policy_does_otherwise(tmp_path: Path) -> None:
-    policies: Any = {f"speed-{speed}": ToyPolicy(speed) for speed in (0.1, 0.8, 1.0)}
-    models: Any = {"true": lambda: imagined(5), "fast": lambda: imagined(5, pace=3.0)}
-    results = compare(policies, simulated(5), models, TRIALS, tmp_path)
-    same, fast = (row["policies"].values() for row in results["runs"])
-    assert all(each["replayed"] == each["simulator"] == each["world_model"] for each in same)
+    # The actions of an episode in a model, replayed in the simulator, tell what the model mistakes.
+    assert all(each["replayed"] == each["simulator"] == each["world_model"] for each in same["policies"].values())
     # In the fast world the dot arrives by actions that do not take it there in the simulator.
-    rates = np.array([[np.mean(each[of]) for of in ("world_model", "replayed", "simulator")] for each in fast])
+    of = ("world_model", "replayed", "simulator")
+    rates = np.array([[np.mean(each[kind]) for kind in of] for each in fast["policies"].values()])
     assert (rates[1:, 0] > rates[1:, 1]).all()
     model, replays, true = rates.mean(0)
     shares = " | ".join(f"{100 * rate:.0f} %" for rate in (model, replays, true))
-    line = f"| fast | all | {shares} | {model - replays:+.3f} | {replays - true:+.3f} |"
-    assert line in squeezed(tmp_path / "results.md")
-    again = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("replayed/made.json")}
-    assert len(again) == 6
-    compare(policies, simulated(5), models, TRIALS, tmp_path)
-    assert again == {path: path.stat().st_mtime_ns for path in again}
+    assert f"| fast | all | {shares} | {model - replays:+.3f} | {replays - true:+.3f} |" in text
+    again = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("made.json")}
+    assert len([path for path in again if path.parent.name == "replayed"]) == 12
+    assert compare(policies, simulated(5), models, TRIALS, tmp_path) == results
+    assert again == {path: path.stat().st_mtime_ns for path in again}, "something is run again"
 
 
 class Coasting(ToySimulator):

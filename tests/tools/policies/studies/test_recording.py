@@ -54,27 +54,26 @@ def test_what_a_policy_did_is_simulated_again(gl: str, tmp_path: Path) -> None:
     assert "episodes of 3 frames and 14 numbers an action; sim.frames 9" in str(refused.value)
 
 
+def write_recording(path: Path, **origin: int) -> None:
+    provenance = {"expert": {"mode": POLICY}, "episode": 0, "seed": 0} | origin
+    record = {"actions": np.zeros((CONFIG.frames, CONFIG.action_dim), np.float32), "provenance": provenance}
+    write_store(path, "clips", {"train": [record]}, {})
+
+
 def test_another_recording_at_the_same_path_is_read(tmp_path: Path) -> None:
     seeds = []
     for seed in (1, 2):
-        provenance = {"expert": {"mode": POLICY}, "episode": 0, "seed": seed}
-        record = {"actions": np.zeros((CONFIG.frames, CONFIG.action_dim), np.float32), "provenance": provenance}
-        write_store(tmp_path / "store", "clips", {"train": [record]}, {})
+        write_recording(tmp_path / "store", seed=seed)
         os.utime(tmp_path / "store" / MANIFEST, (seed, seed))  # the clock may be too coarse, and the inode the same
         seeds.append(recorded(CONFIG, tmp_path / "store", 0, "episode").seed)
     assert seeds == [1, 2]
 
 
-def test_windows_of_a_recording_are_no_recordings(tmp_path: Path) -> None:
-    provenance = {"expert": {"mode": POLICY}, "episode": 0, "seed": 0, WINDOW: 3}
-    record = {"actions": np.zeros((CONFIG.frames, CONFIG.action_dim), np.float32), "provenance": provenance}
-    write_store(tmp_path / "store", "clips", {"train": [record]}, {})
+def test_windows_and_clips_that_no_policy_made_are_no_recordings(tmp_path: Path) -> None:
+    write_recording(tmp_path / "store", **{WINDOW: 3})
     with pytest.raises(UserError) as refused:
         recorded(CONFIG, tmp_path / "store", 0, "episode")
     assert "begin in the middle of episodes" in str(refused.value)
-
-
-def test_clips_that_no_policy_made_are_no_recordings(tmp_path: Path) -> None:
     store = demo_store(tmp_path / "demos")
     with pytest.raises(UserError) as refused:
         training_plans(replace(CONFIG, recipe=(f"recorded:{store.path}",)))
