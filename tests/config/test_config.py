@@ -23,6 +23,9 @@ BASE = c.Config(
 )
 
 
+WHOLE = {"read_previous": True, "whole_frames": True}
+
+
 def keyed(part: Any, prefix: str = "", in_key: bool = True) -> list[tuple[str, bool]]:
     """(dotted path, whether the content key covers it) of every plain field within ``part``."""
     paths: list[tuple[str, bool]] = []
@@ -106,20 +109,10 @@ def test_clips_of_another_store_and_those_that_begin_midway_may_begin_anywhere()
     assert not Architecture.create(with_values(BASE, {"train.curriculum": (mixed,)})).one_start
 
 
-def test_a_stored_configuration_with_an_unknown_field_is_refused_by_name() -> None:
-    plain = c.to_dict(BASE)
-    plain["train"]["optimizer"]["momentum"] = 0.9
-    with pytest.raises(c.ConfigError, match="AdamW has no field momentum"):
-        c.from_dict(c.Config, plain)
-
-
-def test_a_stored_configuration_is_fields_by_name_and_may_lack_some() -> None:
+def test_a_stored_configuration_may_lack_fields() -> None:
     plain = c.to_dict(BASE)
     del plain["train"]["seed"]
     assert c.from_dict(c.Config, plain) == BASE
-    for damaged in ([], [["width", 3]], 3):
-        with pytest.raises(c.ConfigError, match="ModelConfig must be fields by name"):
-            c.from_dict(c.Config, plain | {"model": damaged})
 
 
 @pytest.mark.parametrize(
@@ -140,9 +133,12 @@ def test_a_stored_configuration_is_fields_by_name_and_may_lack_some() -> None:
         ("sim.camera", ["front"], r"SimConfig.camera must be text; it is \['front'\]"),
         ("name", {}, "Config.name must be text; it is {}"),
         ("model.family", 3, "model has no family"),
+        ("model", [["width", 3]], "ModelConfig must be fields by name"),
+        ("model", 3, "ModelConfig must be fields by name"),
+        ("train.optimizer.momentum", 0.9, "AdamW has no field momentum"),
     ],
 )
-def test_a_stored_value_of_another_type_is_refused_by_name(path: str, value: Any, message: str) -> None:
+def test_a_stored_field_that_does_not_fit_is_refused_by_name(path: str, value: Any, message: str) -> None:
     plain = c.to_dict(BASE)
     *heads, name = path.split(".")
     part = plain
@@ -160,9 +156,6 @@ def test_a_stored_value_of_another_type_is_refused_by_name(path: str, value: Any
         ("", {"prompt_frames": 6}, "prompt_frames is 6 of 6 frames"),
         ("train", {"seed": -1}, "train.seed is -1; a seed is a whole number from 0 to 4294967295"),
         ("tokenizer_train", {"seed": 2**32}, "tokenizer_train.seed is 4294967296; a seed"),
-        ("sim", {"seed": 2**70}, "sim.seed is 1180591620717411303424; a seed"),
-        ("model.sample", {"seed": -3}, "model.sample.seed is -3; a seed"),
-        ("train.optimizer", {"learning_rate": math.nan}, "optimizer.learning_rate is nan"),
         ("train.optimizer", {"learning_rate": math.inf}, "train.optimizer.learning_rate is inf; it must be a finite"),
         ("train.optimizer", {"learning_rate": -1e-3}, "optimizer.learning_rate is -0.001; it must be at least 0"),
         ("train.optimizer", {"betas": (0.9, 1.5)}, "optimizer.betas are (0.9, 1.5); they are two numbers"),
@@ -173,14 +166,12 @@ def test_a_stored_value_of_another_type_is_refused_by_name(path: str, value: Any
         ("runtime", {"log_every": 2**63}, "runtime.log_every is 9223372036854775808; it must fit in 64 bits"),
         ("", {"train": c.TrainConfig(curriculum=(c.CurriculumStageConfig(epochs=math.inf),))}, "epochs is inf"),
         ("tokenizer", {"vocabularies": 0}, "tokenizer.vocabularies is 0; it must be at least 1"),
-        ("tokenizer", {"norm_groups": 0}, "tokenizer.norm_groups is 0; it must be at least 1"),
         ("tokenizer", {"channel_multipliers": ()}, "tokenizer.channel_multipliers are ()"),
         ("sim", {"frames": 1}, "sim.frames is 1"),
         ("sim", {"test_episodes": 8}, "sim.test_episodes is 8"),
         ("sim", {"test_episodes": 0}, "sim.test_episodes is 0"),
         ("sim", {"control_steps": 0}, "sim.control_steps is 0"),
         ("sim", {"image_size": 65}, "images have 65 pixels a side, which the downsampling 8"),
-        ("tokenizer", {"patch_size": 48}, "images have 64 pixels a side, which the downsampling 96"),
         ("tokenizer", {"code_bits": 9}, "tokenizer.code_bits 9 does not divide into 2"),
         ("tokenizer", {"norm_groups": 5}, "tokenizer.norm_groups 5"),
         ("tokenizer", {"patch_size": 32, "adaptive_norm": True}, "needs a grid of more than one cell"),
@@ -191,6 +182,11 @@ def test_a_stored_value_of_another_type_is_refused_by_name(path: str, value: Any
         ("model", {"action_encoder": "none", "departures.integrate_actions": True}, "model.action_encoder is none"),
         ("model", {"action_encoder": "none", "departures.action_dropout": 0.1}, "model.action_encoder is none"),
         ("model", {"action_encoder": "norms", "public_code.qk_norm": True}, "qk_norm leaves the blocks without norms"),
+        ("model.departures", {"whole_frames": True}, "read_previous is off"),
+        ("model.departures", WHOLE | {"visible_prefix": 0.5}, "model.departures.visible_prefix is 0.5"),
+        ("model.departures", {"self_conditioning": 0.5}, "self_conditioning is 0.5, but without whole_frames"),
+        ("model.departures", WHOLE | {"self_conditioning": 1.5}, "self_conditioning is 1.5; it must be 0 … 1"),
+        ("model.departures", WHOLE | {"self_conditioning_after": -1}, "self_conditioning_after is -1; it must be at"),
         ("model.departures", {"action_dropout": 1.0}, "model.departures.action_dropout is 1.0"),
         ("model.loss", {"num_keypoints": 0}, "model.loss.num_keypoints is 0"),
         ("model.sample", {"steps": 0}, "model.sample.steps is 0"),
@@ -239,29 +235,20 @@ def test_what_cannot_run_is_refused_by_name(path: str, changes: dict[str, Any], 
 
 
 @pytest.mark.parametrize(
-    ("changes", "names"),
+    ("changes", "line"),
     [
-        ({"model.autoencoder.res_blocks": 0}, "model.autoencoder.res_blocks is 0"),
-        ({"model.autoencoder.kl_weight": -1.0}, "model.autoencoder.kl_weight is -1.0"),
-        ({"model.autoencoder.widths": (32, 32)}, "model.autoencoder.widths are (32, 32); give one for each level"),
-        ({"model.autoencoder.image_noise": (0.0, -1.0)}, "model.autoencoder.image_noise is (0.0, -1.0)"),
-        ({"model.text.tokens": 0}, "model.text.tokens is 0"),
-        ({"model.text.dropout": 1.0}, "model.text.dropout is 1.0"),
-        ({"model.text.file": "a", "model.text.tasks": ("b",)}, "model.text.tasks have learned tokens"),
-        ({"model.blocks": 0}, "model.blocks is 0"),
+        ({"keep_last": 0}, "keep_last is 0"),
+        ({"keep_every": -1}, "keep_every is -1"),
+        ({"skip_budget": -1}, "skip_budget is -1"),
+        ({"steps": 20, "restarts": (50,)}, "they lie before its end, steps = 20"),
+        ({"steps": 20, "restarts": (10, 5)}, "they are steps above 0, in their order"),
+        ({"early_stop": c.EarlyStopConfig(), "keep_best": False}, "early_stop is on but keep_best is off"),
     ],
 )
-def test_what_cogvideox_cannot_run_is_refused_by_name(changes: dict[str, Any], names: str) -> None:
+def test_what_a_loop_cannot_do_is_refused_by_name(changes: dict[str, Any], line: str) -> None:
     with pytest.raises(c.ConfigError) as caught:
-        with_values(presets.get("cogvideox_tiny"), changes)
-    assert names in str(caught.value)
-
-
-@pytest.mark.parametrize("changes", [{"keep_last": 0}, {"keep_every": -1}, {"skip_budget": -1}])
-def test_what_a_loop_cannot_keep_is_refused_by_name(changes: dict[str, int]) -> None:
-    with pytest.raises(c.ConfigError) as caught:
-        c.LoopConfig(**changes)  # type: ignore[arg-type]
-    assert next(iter(changes)) in str(caught.value)
+        c.LoopConfig(**changes)
+    assert line in str(caught.value)
 
 
 def test_the_network_fits_clips_and_tokenizer_by_itself() -> None:
@@ -273,12 +260,8 @@ def test_the_network_fits_clips_and_tokenizer_by_itself() -> None:
     assert config.grid == config.tokenizer.grid(128) == 16
     assert (network.code_bits, network.vocabularies, network.vocabulary_size) == (10, 5, 4)
     assert Architecture.create(with_values(config, {"model.max_frames": 12})).frames == 12
-
-
-def test_a_model_without_actions_fits_any_data() -> None:
-    for steps in (2, 4):
-        config = with_values(BASE, {"model.action_encoder": "none", "sim.control_steps": steps})
-        assert Architecture.create(config).action_inputs == 0
+    without_actions = with_values(BASE, {"model.action_encoder": "none", "sim.control_steps": 2})
+    assert Architecture.create(without_actions).action_inputs == 0
 
 
 def test_more_keypoints_than_tracks_are_fine() -> None:
@@ -294,27 +277,16 @@ def test_a_loop_has_its_own_settings_and_those_that_both_share() -> None:
     assert [(loop.steps, loop.seed, loop.profile) for loop in loops] == [(7, 0, 3), (4, 5, 3)]
 
 
-def test_the_schedule_of_a_loop_restarts_within_its_steps_in_their_order() -> None:
-    with pytest.raises(c.ConfigError, match="they lie before its end, steps = 20"):
-        c.LoopConfig(steps=20, restarts=(50,))
-    with pytest.raises(c.ConfigError, match="they are steps above 0, in their order"):
-        c.LoopConfig(steps=20, restarts=(10, 5))
-
-
 def test_the_paper_s_loss_weights() -> None:
     model = c.RoboScapeConfig()
     assert model.loss_weights == {"rgb": 1.0, "depth": 1.0, "keypoint": 0.01, "attention": 1.0}
     assert c.RoboScapeConfig(depth=c.NoDepth()).loss_weights == {"rgb": 1.0, "keypoint": 0.01, "attention": 1.0}
     assert model.loss.gamma == 5.0
     assert c.GenieConfig().loss_weights == {"rgb": 1.0}
-
-
-@pytest.mark.parametrize("off", ["depth", "keypoint", "attention"])
-def test_a_weight_of_0_switches_its_term_off(off: str) -> None:
-    without: dict[str, Any] = {f"{off}_weight": 0.0}
-    loss = c.LossConfig(**without)
-    expected = {name: weight for name, weight in c.RoboScapeConfig().loss_weights.items() if name != off}
-    assert c.RoboScapeConfig(loss=loss).loss_weights == expected
+    for off in ("depth", "keypoint", "attention"):
+        without: dict[str, Any] = {f"{off}_weight": 0.0}
+        expected = {name: weight for name, weight in model.loss_weights.items() if name != off}
+        assert c.RoboScapeConfig(loss=c.LossConfig(**without)).loss_weights == expected, "0 switches a term off"
 
 
 @given(patch=st.sampled_from([1, 2, 4]), levels=st.integers(1, 4), cells=st.integers(1, 8))

@@ -24,20 +24,13 @@ WORLD_MODELS = {  # (RGB branch with what it shares, all)
 }
 
 
-@pytest.mark.parametrize("name", WORLD_MODELS)
-def test_full_size_world_models_have_their_exact_counts(name: str) -> None:
-    parts = by_part(jax.eval_shape(create_model(presets.get(name)).init, jax.random.key(0)))
-    alone = count(parts["rgb"]) + count(parts["shared"])
-    assert (alone, count(parts)) == WORLD_MODELS[name]
-
-
 @pytest.mark.parametrize(("name", "published"), [("roboscape_s", 268), ("roboscape_m", 537), ("roboscape_l", 1074)])
 def test_the_cache_of_a_rollout_in_bf16_has_the_known_size(name: str, published: int) -> None:
     assert round(2 * count(create_model(presets.get(name)).cache_shapes(16)) / 1e6) == published
 
 
 @pytest.mark.parametrize("name", WORLD_MODELS)
-def test_full_size_presets_are_the_papers_setting(name: str) -> None:
+def test_full_size_presets_are_the_papers_setting_with_their_exact_counts(name: str) -> None:
     config = presets.get(name)
     network = Architecture.create(config)
     assert (config.clips.image_size, network.grid, network.code_bits) == (256, 16, 18)
@@ -46,18 +39,14 @@ def test_full_size_presets_are_the_papers_setting(name: str) -> None:
     assert isinstance(config.model, RoboScapeConfig if roboscape else GenieConfig)
     assert config.model.uses_depth == roboscape
     assert (network.action_inputs > 0) == (roboscape or name.endswith("actions"))
-
-
-@pytest.mark.parametrize("name", WORLD_MODELS)
-def test_the_presets_of_the_paper_have_its_depth_branch_and_those_of_physics_a_head(name: str) -> None:
-    model = presets.get(name).model
     if name.startswith("roboscape_physics"):
-        assert isinstance(model, RoboScapeConfig)
         paper = presets.get(name.replace("_physics", "")).model
         assert isinstance(paper, RoboScapeConfig)
-        assert model == replace(paper, depth=DepthHead(), loss=replace(paper.loss, keypoints="none"))
+        assert config.model == replace(paper, depth=DepthHead(), loss=replace(paper.loss, keypoints="none"))
     else:
-        assert Architecture.create(presets.get(name)).depth == ("branch" if name.startswith("roboscape") else "none")
+        assert network.depth == ("branch" if roboscape else "none")
+    parts = by_part(jax.eval_shape(create_model(config).init, jax.random.key(0)))
+    assert (count(parts["rgb"]) + count(parts["shared"]), count(parts)) == WORLD_MODELS[name]
 
 
 def test_full_size_presets_of_every_family_are_scored_alike() -> None:

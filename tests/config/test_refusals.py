@@ -4,7 +4,7 @@ import dataclasses
 
 import pytest
 
-from rsjax.config import ConfigError, EarlyStopConfig, LoopConfig
+from rsjax.config import ConfigError
 from rsjax.evaluation.protocols import PROTOCOLS
 from rsjax.tools.commands.cli import parse
 from rsjax.tools.commands.train import Options
@@ -25,6 +25,14 @@ REFUSED = {
     'tiny --train.curriculum [{"frames":1}]': "stage has 1 frames; a clip has at least 2",
     'tiny --tokenizer-train.curriculum [{"components":[{"annotations":"estimated"}]}]': "which only a world model can",
     "tiny --tokenizer-train.entropy-group 7": "entropy_group is 7; it must divide the 16 images",
+    "cogvideox_tiny --model.autoencoder.res-blocks 0": "model.autoencoder.res_blocks is 0",
+    "cogvideox_tiny --model.autoencoder.kl-weight -1": "model.autoencoder.kl_weight is -1.0",
+    "cogvideox_tiny --model.autoencoder.widths 32 32": "model.autoencoder.widths are (32, 32); give one for each level",
+    "cogvideox_tiny --model.autoencoder.image-noise 0 -1": "model.autoencoder.image_noise is (0.0, -1.0)",
+    "cogvideox_tiny --model.text.tokens 0": "model.text.tokens is 0",
+    "cogvideox_tiny --model.text.dropout 1": "model.text.dropout is 1.0",
+    "cogvideox_tiny --model.text.file a --model.text.tasks b": "model.text.tasks have learned tokens",
+    "cogvideox_tiny --model.blocks 0": "model.blocks is 0",
     "cogvideox_tiny --model.position-scale 0": "model.position_scale is 0.0; it must be above 0",
     "cogvideox_tiny --model.image-dropout 1": "model.image_dropout is 1.0; it is a share of the clips",
     "cogvideox_tiny --model.width 30": "model.width is 30; it must be divisible by model.heads 6",
@@ -59,12 +67,6 @@ def test_settings_that_do_not_fit_are_refused_by_name(line: str) -> None:
     with pytest.raises(ConfigError) as refused:
         parse(line.split(), "rsjax train", "", Options())
     assert REFUSED[line] in str(refused.value)
-
-
-def test_the_best_weights_are_kept_where_a_training_may_stop_early() -> None:
-    with pytest.raises(ConfigError) as refused:
-        LoopConfig(early_stop=EarlyStopConfig(), keep_best=False)
-    assert "early_stop is on but keep_best is off" in str(refused.value)
 
 
 @pytest.mark.parametrize(("field", "value"), [("resolution", 3), ("splits", ())])

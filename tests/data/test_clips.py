@@ -17,10 +17,6 @@ def test_numbers_are_spread_evenly_from_the_first_to_the_last(size: int, count: 
     assert not len(steps) or steps.max() - steps.min() <= 1
 
 
-def test_a_split_no_larger_than_asked_for_is_taken_whole() -> None:
-    assert spread(range(7), 7) == spread(range(7), 20) == list(range(7))
-
-
 @pytest.mark.parametrize(
     ("origin", "rate"),
     [

@@ -86,6 +86,7 @@ def test_a_stage_can_choose_scenes_where_the_store_names_them(own: Store, tmp_pa
         choose(part, own)
 
 
+@settings(max_examples=30)
 @given(
     st.lists(
         st.tuples(st.sampled_from(["simple", "all", "difficult/pick*"]), st.integers(1, 30), st.booleans()), min_size=1

@@ -1,5 +1,4 @@
 import json
-import shutil
 from collections.abc import Callable
 from itertools import chain
 from pathlib import Path
@@ -71,12 +70,6 @@ def test_parts_are_of_one_size_and_together_the_whole(
     ]
     assert sorted(chain(*parts)) == list(range(clips))
     assert max(map(len, parts)) - min(map(len, parts)) <= 1
-
-
-def test_a_store_is_moved_with_its_directory(tmp_path: Path) -> None:
-    clip_store(tmp_path / "a")
-    shutil.move(tmp_path / "a", tmp_path / "elsewhere")
-    assert numbers(open_store(tmp_path / "elsewhere")) == list(range(6))
 
 
 def test_what_does_not_go_together_is_refused(tmp_path: Path) -> None:

@@ -1,7 +1,6 @@
 """Moved copies of clips."""
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -23,9 +22,3 @@ def test_tracks_move_with_the_picture_and_are_hidden_outside() -> None:
     np.testing.assert_allclose(record["tracks"], [[[0.6, 0.4], [1.0, 0.1]]], atol=1e-6)
     assert record["visible"].tolist() == [[True, False]]
     assert record["tracks"].dtype == np.float32
-
-
-@pytest.mark.parametrize("shape", [(3, 4, 4), (3, 4, 4, 3)])
-def test_no_move_changes_nothing(shape: tuple[int, ...]) -> None:
-    images = np.random.default_rng(0).random(shape)
-    np.testing.assert_array_equal(moved(images, 0, 0), images)

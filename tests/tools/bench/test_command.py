@@ -26,7 +26,8 @@ def test_writes_what_it_shows(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, c
     out = tmp_path / "new" / "bench.json"
     call(monkeypatch, "debug", "--only", "loader", "--json", str(out), "--train.batch-size", "3")
     numbers: dict[str, Any] = json.loads(out.read_text())
-    assert numbers["preset"] == "debug" and numbers["batch"] == 1
+    assert numbers["preset"] == "debug" and numbers["batch"] == 1 and numbers["loader_clips_per_s"] > 0
+    assert not [name for name in numbers if name.startswith(("train_", "sample_", "tokenizer_", "matmul_"))]
     shown = capsys.readouterr().out
     assert all(name in shown for name in numbers)
 

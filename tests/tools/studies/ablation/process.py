@@ -20,7 +20,7 @@ from rsjax.tools.studies.ablation import sweep
 from rsjax.tools.studies.ablation.grid import Choice
 from tests.tools.studies.ablation import toy
 
-AXES = ("model.loss.keypoints=printed,none", "tokenizer_train.entropy_weight=0.1,0.2", "model.depth=branch,none")
+AXES = ("model.loss.keypoints=printed,none", "tokenizer_train.entropy_weight=0.1,0.2")
 SCENARIOS = ("together", "together", "tokens", "link")
 
 

@@ -47,7 +47,7 @@ grids = st.lists(st.sampled_from(sorted(VALUES)), unique=True, max_size=3).flatm
 seeds = st.lists(st.integers(0, 2**32 - 1), min_size=1, max_size=3, unique=True)
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=15)
 @given(grids, seeds)
 def test_every_combination_is_there_once_in_order_and_is_what_it_says(
     grid: dict[str, list[Any]], seeds: list[int]
@@ -77,12 +77,6 @@ def test_names_that_had_to_be_changed_stay_apart() -> None:
     assert (
         cell_name({"model.loss.gamma": 5.0, "model.depth": "head"}, 3) == "model.loss.gamma=5.0,model.depth=head,seed=3"
     )
-
-
-def test_more_than_a_thousand_seeds_are_refused() -> None:
-    with pytest.raises(ConfigError) as error:
-        expand(DEBUG, {}, range(1001))
-    assert str(error.value) == "--seeds: 1,001 of them; name 1,000 at most"
 
 
 def test_without_axes_there_is_a_cell_per_seed() -> None:
@@ -169,10 +163,10 @@ def test_cells_that_cannot_run_are_named_before_any_runs() -> None:
     assert line in str(caught.value)
 
 
-@pytest.mark.parametrize("seeds", [(), (1, 1), (-1,), (2**32,)])
-def test_seeds_are_distinct_and_in_range(seeds: tuple[int, ...]) -> None:
-    with pytest.raises(ConfigError, match="--seeds"):
-        toy.grid(seeds=seeds)
+def test_seeds_are_distinct_in_range_and_a_thousand_at_most() -> None:
+    for seeds in ((), (1, 1), (-1,), (2**32,), tuple(range(1001))):
+        with pytest.raises(ConfigError, match="--seeds"):
+            toy.grid(seeds=seeds)
 
 
 def test_a_weight_of_a_term_that_is_off_is_reported() -> None:
@@ -223,9 +217,11 @@ def test_a_grid_over_sections_is_read_as_it_was_written_and_grows(tmp_path: Path
     assert read_grid(tmp_path) == grid
     names = add(tmp_path, toy.grid("model.depth=head,small_branch", base=base))
     assert names == ("model.depth=head,seed=0", "model.depth=small_branch,seed=0")
+    before = (tmp_path / "grid.json").read_bytes()
     with pytest.raises(ConfigError) as refused:
         add(tmp_path, toy.grid("model.depth=none,head", seeds=(0, 1)))
-    assert "(model.depth.feed_back is False there, True here)" in str(refused.value)
+    line = "another configuration (model.depth.feed_back is False there, True here); choose another --out"
+    assert line in str(refused.value) and (tmp_path / "grid.json").read_bytes() == before
     small = with_values(DEBUG, {"model.depth": "small_branch"})
     with pytest.raises(ConfigError) as refused:
         toy.grid("model.depth=small_branch,head", "model.depth.width=32,64", base=small)
@@ -255,16 +251,6 @@ def test_cells_of_several_bases_keep_their_values_and_names_apart(tmp_path: Path
     grid = read_grid(tmp_path)
     assert grid is not None
     assert [toy.roboscape(config).loss.gamma for config in grid.cells.values()] == [4.0, 5.0, 6.0, 7.0]
-
-
-def test_another_configuration_is_refused_by_name_and_nothing_changes(tmp_path: Path) -> None:
-    add(tmp_path, toy.grid("model.loss.gamma=4,5"))
-    before = (tmp_path / "grid.json").read_bytes()
-    wide = with_values(DEBUG, {"model.width": 64})
-    with pytest.raises(ConfigError) as caught:
-        add(tmp_path, toy.grid("model.loss.gamma=4,5", base=wide))
-    assert "another configuration (model.width is 32 there, 64 here); choose another --out" in str(caught.value)
-    assert (tmp_path / "grid.json").read_bytes() == before
 
 
 def test_how_runs_are_carried_out_and_the_seed_may_differ(tmp_path: Path) -> None:

@@ -65,43 +65,43 @@ def fail_in(monkeypatch: pytest.MonkeyPatch, name: str, error: BaseException) ->
     monkeypatch.setattr(stages, "run_all", failing)
 
 
-def test_every_cell_is_a_whole_run_and_what_is_shared_is_made_once(tmp_path: Path) -> None:
-    grid = toy.grid("model.loss.gamma=4,5", "tokenizer_train.entropy_weight=0.1,0.2", seeds=(0, 1, 2))
-    assert sweep_in(tmp_path, grid) == ["finished"] * 12
-    assert counts(tmp_path) == {"collect": 1, "tokenizer": 2, "tokens": 2} | dict.fromkeys(STAGES[3:], 12)
+def test_every_cell_is_a_whole_run_what_is_shared_is_made_once_and_the_table_is_numpys(tmp_path: Path) -> None:
+    grid = toy.grid("model.loss.gamma=4,5", "tokenizer_train.entropy_weight=0.1,0.2", seeds=(0, 1))
+    assert sweep_in(tmp_path, grid) == ["finished"] * 8
+    assert counts(tmp_path) == {"collect": 1, "tokenizer": 2, "tokens": 2} | dict.fromkeys(STAGES[3:], 8)
     for there in runs(tmp_path, grid):
         assert all(there.finished(stage) for stage in STAGES)
         for stage in ("tokenizer", "tokens"):
             assert (there.output(stage) / "weights").read_text() == there.keys()[stage]
-            assert (there.output(stage) / "weights").stat().st_nlink >= 1 + 6
+            assert (there.output(stage) / "weights").stat().st_nlink >= 1 + 4
             assert (there.directory / stage / "log.jsonl").stat().st_nlink == 1, "logs are written on: never linked"
             assert not (there.directory / stage / "checkpoints").exists()
     assert not list(tmp_path.rglob("*.linking"))
+    for row in json.loads((tmp_path / "out" / "table.json").read_text())["rows"]:
+        gamma = row["values"]["model.loss.gamma"]
+        weight = row["values"]["tokenizer_train.entropy_weight"]
+        cells = [c for c in grid.cells.values() if c.tokenizer_train.entropy_weight == weight]
+        scores = [toy.psnr(config) for config in cells if toy.roboscape(config).loss.gamma == gamma]
+        assert row["psnr"] == {"mean": np.mean(scores), "std": np.std(scores, ddof=1), "n": 2}
+    names = {path.name for path in (tmp_path / "out").glob("table.*")}
+    assert names == {f"table.{kind}" for kind in ("md", "csv", "json", "png")}
 
 
-def test_the_table_is_numpys_over_the_metrics_of_the_runs(tmp_path: Path) -> None:
-    grid = toy.grid("model.loss.gamma=4,5", seeds=(0, 1, 2))
-    sweep_in(tmp_path, grid)
-    rows = json.loads((tmp_path / "out" / "table.json").read_text())["rows"]
-    for row in rows:
-        cells = [
-            config
-            for config in grid.cells.values()
-            if toy.roboscape(config).loss.gamma == row["values"]["model.loss.gamma"]
-        ]
-        scores = [toy.psnr(config) for config in cells]
-        assert row["psnr"] == {"mean": np.mean(scores), "std": np.std(scores, ddof=1), "n": 3}
-    assert {path.name for path in (tmp_path / "out").glob("table.*")} == {
-        f"table.{e}" for e in ("md", "csv", "json", "png")
-    }
-
-
-def test_the_same_command_again_does_nothing(tmp_path: Path) -> None:
+def test_the_same_command_again_does_nothing_but_count_lost_numbers_and_leave_out_damaged_logs(tmp_path: Path) -> None:
     grid = toy.grid("model.loss.gamma=4,5")
     sweep_in(tmp_path, grid)
     kept = {path: time for path, time in files(tmp_path).items() if "seed=0" in str(path) or "shared" in str(path)}
     assert sweep_in(tmp_path, grid) == ["finished", "finished"]
     assert kept.items() <= files(tmp_path).items()
+    metrics = runs(tmp_path, grid)[0].directory / "metrics.json"
+    before = metrics.read_bytes()
+    metrics.write_text("{")
+    assert states(tmp_path, grid) == ["interrupted", "finished"]
+    sweep_in(tmp_path, grid)
+    assert metrics.read_bytes() == before
+    (metrics.parent / "world_model" / "log.jsonl").write_text('{"step"\n{"step": 2, "rgb": 2.0}\n')
+    rows = sweep.write_tables(tmp_path / "out", tmp_path / "data")
+    assert [row.results[0].state for row in rows] == ["interrupted", "finished"]
 
 
 def test_a_cell_that_fails_is_recorded_and_the_others_run_then_it_is_tried_again(
@@ -122,14 +122,11 @@ def test_a_cell_that_fails_is_recorded_and_the_others_run_then_it_is_tried_again
     assert not (tmp_path / "out" / failing / "error.json").exists()
 
 
-@pytest.mark.parametrize("error", [KeyboardInterrupt(), Preempted("SIGTERM")])
-def test_what_ends_the_command_is_not_the_cells_failure(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
-) -> None:
+def test_what_ends_the_command_is_not_the_cells_failure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     grid = toy.grid("model.loss.gamma=4,5,6")
     with monkeypatch.context() as patch:
-        fail_in(patch, list(grid.cells)[1], error)
-        with pytest.raises(type(error)):
+        fail_in(patch, list(grid.cells)[1], Preempted("SIGTERM"))
+        with pytest.raises(Preempted):
             sweep_in(tmp_path, grid)
     assert states(tmp_path, grid) == ["finished", "interrupted", "missing"]
     assert read_run(runs(tmp_path, grid)[1]).reason == "3 of 6 stages are finished"
@@ -153,25 +150,6 @@ def test_a_family_without_tokens_has_no_tokenizer_to_share(tmp_path: Path) -> No
     )
     assert sweep_in(tmp_path, grid) == ["finished"] * 4
     assert counts(tmp_path) == {"collect": 1, "tokens": 1, "world_model": 2} | dict.fromkeys(STAGES[4:], 4)
-
-
-def test_lost_numbers_are_counted_again_from_what_is_there(tmp_path: Path) -> None:
-    grid = toy.grid("model.loss.gamma=4,5")
-    sweep_in(tmp_path, grid)
-    metrics = runs(tmp_path, grid)[0].directory / "metrics.json"
-    before = metrics.read_bytes()
-    metrics.write_text("{")
-    assert states(tmp_path, grid) == ["interrupted", "finished"]
-    sweep_in(tmp_path, grid)
-    assert metrics.read_bytes() == before
-
-
-def test_a_damaged_log_leaves_its_cell_out_of_the_table(tmp_path: Path) -> None:
-    grid = toy.grid("model.loss.gamma=4,5")
-    sweep_in(tmp_path, grid)
-    (runs(tmp_path, grid)[0].directory / "world_model" / "log.jsonl").write_text('{"step"\n{"step": 2, "rgb": 2.0}\n')
-    rows = sweep.write_tables(tmp_path / "out", tmp_path / "data")
-    assert [row.results[0].state for row in rows] == ["interrupted", "finished"]
 
 
 def test_tokens_that_a_run_keeps_itself_are_linked_and_the_cell_reads_its_own(tmp_path: Path) -> None:

@@ -38,21 +38,21 @@ def test_durations(text: str, seconds: float) -> None:
     assert parse_duration(text) == seconds
 
 
-@pytest.mark.parametrize("text", ["", "3", "h", "3hours", "0min", "-3h", "3h and more"])
-def test_what_is_no_duration_is_refused(text: str) -> None:
-    with pytest.raises(ConfigError, match=r"--budget .*not a duration; write 30min"):
-        parse_duration(text)
-
-
-def test_a_budget_of_400_digits_is_refused() -> None:
-    for text in ("9" * 400 + "h", "400d"):
-        with pytest.raises(ConfigError) as raised:
+@pytest.mark.parametrize(
+    ("texts", "line"),
+    [
+        (("", "3", "h", "3hours", "0min", "-3h", "3h and more"), "not a duration; write 30min"),
+        (("9" * 400 + "h", "400d"), "longer than 366 days"),
+    ],
+)
+def test_what_is_no_duration_or_too_long_is_refused(texts: tuple[str, ...], line: str) -> None:
+    for text in texts:
+        with pytest.raises(ConfigError) as refused:
             parse_duration(text)
-        assert "longer than 366 days" in str(raised.value)
-        assert len(str(raised.value)) < 200
+        assert line in str(refused.value) and len(str(refused.value)) < 200
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=8)
 @given(st.floats(120, 2e5), st.floats(1, 10))
 def test_a_larger_budget_never_makes_anything_smaller_and_no_size_exceeds_the_presets(
     seconds: float, by: float
@@ -98,7 +98,7 @@ def test_a_cell_that_shares_its_world_model_costs_its_evaluation_alone(three_hou
     assert tasks[cell.name].seconds == budget.evaluation_seconds(cell.config)
 
 
-@pytest.mark.parametrize("hours", [0.5, 3, 12])
+@pytest.mark.parametrize("hours", [0.5, 12])
 def test_the_estimates_keep_to_the_budget_and_the_tables_come_first(hours: float) -> None:
     plan = make_plan(KNOWN, scale(TINY, hours * HOUR), DATA)
     assert 0.75 * hours * HOUR < sum(task.seconds for task in plan.tasks) <= 1.05 * hours * HOUR
@@ -299,7 +299,6 @@ def test_claims_name_their_arms_and_are_chosen_by_name() -> None:
         toy.claim("toy", ArmComparison("psnr", "with", "none"))
     with pytest.raises(ConfigError, match=r"--only tabel1: no such claim; did you mean 'table1'\? \(claims: table2"):
         chosen(["tabel1"], claims())
-    assert all(budget.SEEDS >= 3 for _ in KNOWN)
 
 
 def test_the_rival_with_channels_of_depth_trains_for_as_long_as_the_one_without(three_hours: Plan) -> None:

@@ -1,9 +1,9 @@
 """Claims put to the test with toys: verdicts, failures, interruptions, measurements, the report."""
 
 import json
+import shutil
 import sys
 from collections import Counter
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,22 +17,22 @@ from rsjax.config import presets
 from rsjax.config.config_fields import with_values
 from rsjax.errors import Preempted
 from rsjax.evaluation.registry import Unavailable
-from rsjax.evaluation.statistics import Verdict
 from rsjax.runtime import HUGE_PAGES
 from rsjax.tools.commands import paper
 from rsjax.tools.pipeline import stages
 from rsjax.tools.pipeline.run import Run
-from rsjax.tools.studies.ablation import sweep
 from rsjax.tools.studies.ablation.figure import draw
-from rsjax.tools.studies.paper import claim_tables, measurements
+from rsjax.tools.studies.paper import claim_tables
 from rsjax.tools.studies.paper import report as page
 from rsjax.tools.studies.paper.budget import HOUR, Scale
-from rsjax.tools.studies.paper.claim import ArmComparison
+from rsjax.tools.studies.paper.claim import ArmComparison, Claim
 from rsjax.tools.studies.paper.claims import baselines
 from rsjax.tools.studies.paper.judge import judge_all
-from rsjax.tools.studies.paper.measurements import measurement
+from rsjax.tools.studies.paper.measurements import measure, measurement
 from rsjax.tools.studies.paper.plan import Plan, make_plan
+from rsjax.tools.studies.paper.result_files import read_claim_result
 from rsjax.tools.studies.paper.run import run_plan, runs_of, write
+from rsjax.tools.studies.tables import as_markdown
 from tests.tools.pipeline.conftest import Commands, command, debug, shared
 from tests.tools.studies.ablation.toy import made
 from tests.tools.studies.paper import toy
@@ -40,129 +40,142 @@ from tests.tools.studies.paper import toy
 __all__ = ["command", "debug", "shared"]
 
 
+@measurement("policies", lambda config: 1.0)
+def policies(run: Run) -> dict[str, list[float]]:
+    """A score of each seed, and trials that often or never succeed."""
+    often = [float(number < 90) for number in range(100)]
+    correlation = {"r": [0.97 + 0.01 * run.config.train.seed], "strong": [0.9], "none": [float("nan")]}
+    return correlation | {"often": often, "never": [0.0] * 100}
+
+
+@measurement("fails once", lambda config: 1.0)
+def fails_once(run: Run) -> dict[str, list[float]]:
+    """Fails for the first run that it is called for; the file has the runs."""
+    tries = run.directory.parents[2] / "tries"
+    earlier = tries.exists()
+    with tries.open("a") as file:
+        file.write(f"{run.directory.name}\n")
+    if not earlier:
+        raise ValueError("once")
+    return {"psnr": [1.0 + toy.keypoints(run.config), 2.0, 3.0]}
+
+
+@measurement("other tasks", lambda config: 0.0)
+def other_tasks(run: Run) -> dict[str, list[float]]:
+    with (run.directory.parents[2] / "refusals").open("a") as file:
+        file.write(f"{run.directory.name}\n")
+    raise Unavailable("one task alone")
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where the cells of the toys' claims are finished; for copies."""
+    place = tmp_path_factory.mktemp("finished")
+    with pytest.MonkeyPatch.context() as patch:
+        toy.stub_stages(patch, place)
+        run(toy.plan(toy.claim("one"), toy.claim("two", rank=5)), place)
+    return place
+
+
 @pytest.fixture(autouse=True)
 def stubs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     toy.stub_stages(monkeypatch, tmp_path)
 
 
-def run(plan: Plan, place: Path) -> dict[str, Any]:
+@pytest.fixture
+def cells(finished: Path, tmp_path: Path) -> None:
+    """Finished cells in the test's directory."""
+    shutil.copytree(finished, tmp_path, symlinks=True, dirs_exist_ok=True)
+
+
+def run(plan: Plan, place: Path) -> Any:
     run_plan(plan, place / "out", place / "data", "the command")
     return report(place)
 
 
-def report(place: Path) -> dict[str, Any]:
-    content: dict[str, Any] = json.loads((place / "out" / "report.json").read_text())
-    return content
+def report(place: Path) -> Any:
+    return json.loads((place / "out" / "report.json").read_text())["claims"]
 
 
-@pytest.mark.parametrize(("gain", "verdict"), [(0.5, "holds"), (-0.5, "does not hold"), (0.0, "equal")])
-def test_a_claim_is_judged_by_paired_differences_over_seeds_and_clips(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, gain: float, verdict: Verdict
-) -> None:
-    """Clips differ by 3 dB, the arms by 0.5 dB or not at all: only paired differences can tell."""
-    toy.stub_stages(monkeypatch, tmp_path, gain)
-    (claim,) = run(toy.plan(toy.claim()), tmp_path)["claims"]
-    (compared,) = claim["comparisons"]
-    assert claim["verdict"] == verdict
-    assert compared["verdict"] == ("equal within 0.1 dB" if verdict == "equal" else verdict)
-    assert (compared["seeds"], compared["clips"]) == ([3, 3], toy.CLIPS)
+def judged(place: Path, *claims: Claim) -> Any:
+    """Measures finished cells, and returns what the report says of claims about them."""
+    plan = toy.plan(*claims)
+    runs = runs_of(plan, place / "out", place / "data")
+    for task in plan.tasks:
+        if task.measurement:
+            measure(runs[task.cell], task.measurement)
+    write(plan, place / "out", place / "data", "the command")
+    return report(place)
+
+
+@pytest.mark.usefixtures("cells")
+def test_a_claim_is_judged_by_paired_differences_and_what_was_not_measured_says_why(tmp_path: Path) -> None:
+    """Clips differ by 3 dB, the arms by 0.5 dB: only paired differences can tell."""
+    (claim,) = judged(
+        tmp_path, toy.claim("toy", *(ArmComparison(name, "with", "without") for name in ("psnr", "ssim")))
+    )
+    compared, lacking = claim["comparisons"]
+    assert claim["verdict"] == "holds", "of what could be measured"
+    assert (compared["verdict"], compared["seeds"], compared["clips"]) == ("holds", [3, 3], toy.CLIPS)
     numbers = compared["values"]
-    assert numbers["low"] < gain < numbers["high"] and numbers["difference"] == pytest.approx(gain, abs=0.05)
+    assert numbers["low"] < 0.5 < numbers["high"] and numbers["difference"] == pytest.approx(0.5, abs=0.05)
     assert numbers["published"] == 0.5
-    with_, without = claim["arms"]
-    means = [arm["values"]["psnr"]["mean"] for arm in (with_, without)]
+    means = [arm["values"]["psnr"]["mean"] for arm in claim["arms"]]
     assert means[0] - means[1] == pytest.approx(numbers["difference"], abs=0.005)  # clips have four digits
+    assert (lacking["verdict"], lacking["reason"]) == ("not measured", "with: a toy")
+    text = (tmp_path / "out" / "report.md").read_text()
+    assert "not measured: with: a toy" in text
+    assert "<small>with: a toy</small>" in (tmp_path / "out" / "report.html").read_text()
+    read = read_claim_result(tmp_path / "out" / "results" / "toy.json")
+    assert read.verdict == "holds" and [arm.seeds for arm in read.arms] == [(0, 1, 2)] * 2
+    table = as_markdown(claim_tables.claim_tables(claim_tables.claim_content(read))["comparisons"])
+    assert all(line in text for line in table.splitlines())
 
 
+@pytest.mark.usefixtures("cells")
 def test_cells_of_several_claims_run_once_and_a_second_command_runs_none(tmp_path: Path) -> None:
     plan = toy.plan(toy.claim("one"), toy.claim("two", rank=5))
-    first = run(plan, tmp_path)["claims"]
-    trained = [line for line in made(tmp_path) if line.startswith("world_model")]
-    assert len(trained) == len(plan.cells) == 6
-    assert sum(line.startswith("tokenizer") for line in made(tmp_path)) == 1, "shared by all"
-    assert run(plan, tmp_path)["claims"] == first
-    assert [line for line in made(tmp_path) if line.startswith("world_model")] == trained
+    lines = made(tmp_path)
+    assert sum(line.startswith("world_model") for line in lines) == len(plan.cells) == 6
+    assert sum(line.startswith("tokenizer") for line in lines) == 1, "shared by all"
+    first, second = ([claim["comparisons"] for claim in claims] for claims in (report(tmp_path), run(plan, tmp_path)))
+    assert first == second and made(tmp_path) == lines
 
 
-def failing(monkeypatch: pytest.MonkeyPatch, name: str, error: BaseException) -> None:
-    whole = stages.run_all
-
-    def fail(run: Run, command: str = "") -> None:
-        if run.directory.name == name:
-            raise error
-        whole(run, command=command)
-
-    monkeypatch.setattr(stages, "run_all", fail)
-
-
-def test_a_failed_cell_is_counted_and_named_and_tried_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    plan = toy.plan(toy.claim())
-    name = list(plan.cells)[2]
-    with monkeypatch.context() as patch:
-        failing(patch, name, ZeroDivisionError("by zero"))
-        (claim,) = run(plan, tmp_path)["claims"]
-    arm = next(arm for arm in claim["arms"] if arm["failed"])
-    assert (arm["seeds"], arm["failed"]) == ("2 of 3", 1)
-    assert claim["missing"] == [f"{name}: failed (ZeroDivisionError: by zero)"]
-    assert f"- {name}: failed (ZeroDivisionError: by zero)" in (tmp_path / "out" / "report.md").read_text()
-    assert run(plan, tmp_path)["claims"][0]["missing"] == []
-
-
-def test_an_interruption_leaves_a_whole_report_and_the_next_command_goes_on(
+def test_failures_are_named_an_interruption_leaves_a_whole_report_and_the_next_command_does_the_rest(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     plan = toy.plan(toy.claim())
+    names = list(plan.cells)
+    errors = {names[3]: ZeroDivisionError("by zero"), names[5]: Preempted("SIGTERM")}
+    whole = stages.run_all
+
+    def fail(run: Run, command: str = "") -> None:
+        if run.directory.name in errors:
+            raise errors[run.directory.name]
+        whole(run, command=command)
+
     with monkeypatch.context() as patch:
-        failing(patch, list(plan.cells)[3], Preempted("SIGTERM"))
+        patch.setattr(stages, "run_all", fail)
         with pytest.raises(Preempted):
             run(plan, tmp_path)
-    (claim,) = report(tmp_path)["claims"]
-    assert [arm["seeds"] for arm in claim["arms"]] == ["2 of 3", "1 of 3"]
+    (claim,) = report(tmp_path)
+    assert [(arm["seeds"], arm["failed"]) for arm in claim["arms"]] == [("3 of 3", 0), ("1 of 3", 1)]
+    failure = f"{names[3]}: failed (ZeroDivisionError: by zero)"
+    assert failure in claim["missing"] and f"- {failure}" in (tmp_path / "out" / "report.md").read_text()
     assert claim["verdict"] == "cannot tell", "one seed of an arm says nothing about others"
     assert claim["comparisons"][0]["values"]["difference"] == pytest.approx(0.5, abs=0.05)
     before = len(made(tmp_path))
-    assert run(plan, tmp_path)["claims"][0]["verdict"] == "holds"
-    assert len(made(tmp_path)) - before == 3 * 3, "evaluation, report and model of the three cells that were left"
+    (claim,) = run(plan, tmp_path)
+    assert claim["verdict"] == "holds" and claim["missing"] == []
+    assert len(made(tmp_path)) - before == 2 * 3, "evaluation, report and model of the two cells that were left"
 
 
-def test_what_was_not_measured_says_why(tmp_path: Path) -> None:
-    claim = toy.claim("toy", ArmComparison("psnr", "with", "without"), ArmComparison("ssim", "with", "without"))
-    (claim_,) = run(toy.plan(claim), tmp_path)["claims"]
-    assert claim_["verdict"] == "holds", "of what could be measured"
-    assert [each["verdict"] for each in claim_["comparisons"]] == ["holds", "not measured"]
-    assert claim_["comparisons"][1]["reason"] == "with: a toy"
-    assert "not measured: with: a toy" in (tmp_path / "out" / "report.md").read_text()
-    assert "<small>with: a toy</small>" in (tmp_path / "out" / "report.html").read_text()
-
-
-@pytest.fixture
-def longer() -> Iterator[list[str]]:
-    """A measurement that fails at its first run; the list has the runs that it was called for."""
-    called: list[str] = []
-
-    @measurement("longer", lambda config: 1.0)
-    def longer(run: Run) -> dict[str, list[float]]:
-        called.append(run.directory.name)
-        if len(called) == 1:
-            raise ValueError("once")
-        return {"psnr": [1.0 + toy.keypoints(run.config), 2.0, 3.0]}
-
-    yield called
-    measurements._MEASUREMENTS.pop("longer")
-
-
+@pytest.mark.usefixtures("cells")
 def test_a_single_score_per_seed_is_judged_by_welchs_interval(tmp_path: Path) -> None:
     """Such as a correlation over policies, of which no clips can be drawn."""
-
-    @measurement("correlation", lambda config: 1.0)
-    def correlation(run: Run) -> dict[str, list[float]]:
-        return {"r": [0.97 + 0.01 * run.config.train.seed], "strong": [0.9], "none": [float("nan")]}
-
-    same: dict[str, Any] = {"better": "with", "than": "with", "measurement": "correlation"}
-    holds = ArmComparison("r", score="r", than_score="strong", **same)
-    undefined = ArmComparison("r", score="none", than_score="strong", **same)
-    (claim,) = run(toy.plan(toy.claim("toy", holds, undefined)), tmp_path)["claims"]
-    measurements._MEASUREMENTS.pop("correlation")
+    same: dict[str, Any] = {"better": "with", "than": "with", "measurement": "policies", "than_score": "strong"}
+    (claim,) = judged(tmp_path, toy.claim("toy", *(ArmComparison("r", score=score, **same) for score in ("r", "none"))))
     one, other = claim["comparisons"]
     assert (one["verdict"], one["sides"], one["clips"]) == ("holds", "0.980 / 0.900", 1)
     assert one["values"]["sides"] == pytest.approx([0.98, 0.9])
@@ -170,56 +183,45 @@ def test_a_single_score_per_seed_is_judged_by_welchs_interval(tmp_path: Path) ->
     assert (other["verdict"], other["reason"]) == ("not measured", "no clip has a score in all seeds of both")
 
 
-@pytest.mark.parametrize(("rate", "verdict"), [(0.0, "cannot tell"), (0.9, "holds")])
-def test_policies_that_never_succeed_are_not_as_good_as_one_another(
-    tmp_path: Path, rate: float, verdict: Verdict
+@pytest.mark.usefixtures("cells")
+def test_policies_that_never_succeed_are_not_as_good_as_one_another(tmp_path: Path) -> None:
+    claims = judged(
+        tmp_path,
+        *(
+            toy.claim(name, ArmComparison("success", "with", "with", name, name, "policies", margin=-0.1))
+            for name in ("often", "never")
+        ),
+    )
+    assert [claim["verdict"] for claim in claims] == ["holds", "cannot tell"]
+    for claim in claims:
+        (found,) = claim["comparisons"]
+        assert found["values"]["low"] < 0 < found["values"]["high"]
+        assert claim["header"] == [], "the arms' own evaluations have no such score"
+        assert not (tmp_path / "out" / "figures" / f"{claim['name']}.png").exists()
+
+
+@pytest.mark.usefixtures("cells")
+def test_a_measurement_runs_once_per_run_and_again_where_it_failed_unless_the_run_cannot_have_it(
+    tmp_path: Path,
 ) -> None:
-    @measurement("trials", lambda config: 1.0)
-    def trials(run: Run) -> dict[str, list[float]]:
-        hits = [float(number < 100 * rate) for number in range(100)]
-        return {"many": hits, "real": hits}
-
-    compared = ArmComparison("success", "with", "with", "many", "real", "trials", margin=-0.1)
-    (claim,) = run(toy.plan(toy.claim("toy", compared)), tmp_path)["claims"]
-    measurements._MEASUREMENTS.pop("trials")
-    (found,) = claim["comparisons"]
-    assert found["verdict"] == verdict and found["values"]["low"] < 0 < found["values"]["high"]
-    assert claim["header"] == [], "the arms' own evaluations have no such score"
-    assert not (tmp_path / "out" / "figures" / "toy.png").exists()
-
-
-def test_a_measurement_runs_once_per_run_and_again_where_it_failed(tmp_path: Path, longer: list[str]) -> None:
-    plan = toy.plan(toy.claim("toy", ArmComparison("psnr", "with", "without", measurement="longer")))
-    (claim,) = run(plan, tmp_path)["claims"]
-    assert claim["comparisons"][0]["reason"] == "with: ValueError: once"
-    (claim,) = run(plan, tmp_path)["claims"]
+    names = ("fails once", "other tasks")
+    plan = toy.plan(toy.claim("toy", *(ArmComparison("psnr", "with", "without", measurement=name) for name in names)))
+    (claim,) = run(plan, tmp_path)
+    assert [each["reason"] for each in claim["comparisons"]] == ["with: ValueError: once", "with: one task alone"]
+    (claim,) = run(plan, tmp_path)
     assert claim["comparisons"][0]["values"]["difference"] == pytest.approx(1 / 3)
-    assert sorted(longer) == sorted([*plan.cells, next(iter(plan.cells))])
+    assert claim["comparisons"][1]["reason"] == "with: one task alone"
+    tries, refusals = ((tmp_path / name).read_text().split() for name in ("tries", "refusals"))
+    assert sorted(tries) == sorted([*plan.cells, next(iter(plan.cells))])
+    assert sorted(refusals) == sorted(plan.cells)
 
 
-def test_a_measurement_that_a_run_cannot_have_is_tried_once(tmp_path: Path) -> None:
-    tried = []
-
-    @measurement("other tasks", lambda config: 0.0)
-    def other(run: Run) -> dict[str, list[float]]:
-        tried.append(run.directory.name)
-        raise Unavailable("one task alone")
-
-    plan = toy.plan(toy.claim("toy", ArmComparison("psnr", "with", "without", measurement="other tasks")))
-    for _ in range(2):
-        (claim,) = run(plan, tmp_path)["claims"]
-    measurements._MEASUREMENTS.pop("other tasks")
-    assert claim["comparisons"][0]["reason"] == "with: one task alone"
-    assert sorted(tried) == sorted(plan.cells)
-
-
-def test_budgets_share_a_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.usefixtures("cells")
+def test_budgets_share_a_directory(tmp_path: Path) -> None:
     """Cells of another size are others; each budget's report counts its own."""
-    plan = toy.plan(toy.claim())
-    run(plan, tmp_path)
     shorter = toy.plan(toy.claim(), seconds=240)
-    assert shorter.cells.keys() == plan.cells.keys() and shorter.left_out, "debug is the smallest already"
-    write(shorter, tmp_path / "out", tmp_path / "data", "")
+    assert shorter.cells.keys() == toy.plan(toy.claim()).cells.keys()
+    assert shorter.left_out, "debug is the smallest already"
     (outcome,) = judge_all(shorter, runs_of(shorter, tmp_path / "out", tmp_path / "data"))
     assert [len(arm.finished) for arm in outcome.arms] == [3, 3], "also of cells that this budget would leave out"
 
@@ -262,54 +264,39 @@ def test_a_run_of_the_preset_is_a_cell_and_its_scores_are_in_the_report(
 def test_a_budget_may_spend_more_than_its_trainings_are_sized_for(
     command: Commands, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def planned(*options: str) -> list[str]:
-        main(
-            "--seeds",
-            "5",
-            "--vary",
-            "everything",
-            "--data-dir",
-            command.data,
-            "--only",
-            "depth-ways",
-            "--dry-run",
-            *options,
-        )
+    options = ("--seeds", 5, "--vary", "everything", "--data-dir", command.data, "--only", "depth-ways", "--dry-run")
+    planned = []
+    for budget in (("--budget", "3h"), ("--budget", "12h", "--size", "3h")):
+        main(*options, *budget)
         lines = capsys.readouterr().out.splitlines()
-        return [line.split()[3] for line in lines if " missing " in line]
-
-    short = planned("--budget", "3h")
-    long = planned("--budget", "12h", "--size", "3h")
+        planned.append([line.split()[3] for line in lines if " missing " in line])
+    short, long = planned
     assert long[: len(short)] == short
     assert len(long) == 20 > len(short)
 
 
+@pytest.mark.usefixtures("cells")
 def test_seconds_a_frame_stand_beside_each_arm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Those of the predicted frames of one clip, from its prompt."""
-    clip: dict[str, Any] = {
-        "rgb": np.zeros((6, 4, 4, 3), np.uint8),
-        "depth": None,
-        "actions": np.zeros((6, 2), np.float32),
-    }
+    rgb = np.zeros((6, 4, 4, 3), np.uint8)
+    clip: dict[str, Any] = {"rgb": rgb, "depth": None, "actions": np.zeros((6, 2), np.float32)}
     asked: list[Any] = []
 
     def generate(*given: Any, index: Any) -> Video:
         asked.append(given)
-        return Video(clip["rgb"][None])
+        return Video(rgb[None])
 
     trained = SimpleNamespace(model=SimpleNamespace(generate=generate), params={}, assets=None)
     monkeypatch.setattr(baselines, "load", lambda directory: trained)
     monkeypatch.setattr(baselines, "median_seconds", lambda call, budget: (call(), 1.5)[1])
     monkeypatch.setattr(Run, "open_clips", lambda run: SimpleNamespace(source=lambda split: [clip]))
     claim = replace(toy.claim(), beside={"seconds a frame": "seconds a frame"})
-    (found,) = run(toy.plan(claim), tmp_path)["claims"]
+    (found,) = judged(tmp_path, claim)
     assert found["beside"] == ["PSNR of the reconstruction", "seconds a frame"]
     assert [arm["beside"] for arm in found["arms"]] == [["–", "0.3"]] * 2
     assert asked[0][2].rgb.shape == (1, 1, 4, 4, 3) and asked[0][3].shape == (1, 6, 2)
-    assert (
-        "| PSNR of the reconstruction | seconds a frame | trained parameters |"
-        in (tmp_path / "out" / "report.md").read_text()
-    )
+    head = "| PSNR of the reconstruction | seconds a frame | trained parameters |"
+    assert head in (tmp_path / "out" / "report.md").read_text()
 
 
 @pytest.mark.parametrize("sound", [True, False])
@@ -332,7 +319,7 @@ def test_weights_of_metrics_that_come_later_train_nothing_again(tmp_path: Path, 
         assert (there.output("world_model") / "weights").read_text() == there.keys()["world_model"]
 
 
-@pytest.mark.usefixtures("longer")
+@pytest.mark.usefixtures("cells")
 def test_a_clip_is_shown_as_every_arm_predicts_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The one in the middle by the first arm's error among those that all arms kept, whatever else one of them kept."""
     kept = {"with": ([0, 2, 5], [40, 0, 20]), "without": ([0, 2, 4, 5], [1, 2, 9, 3])}
@@ -352,16 +339,17 @@ def test_a_clip_is_shown_as_every_arm_predicts_it(tmp_path: Path, monkeypatch: p
 
     monkeypatch.setattr(page, "read_frames", frames)
     monkeypatch.setattr(page, "filmstrip", sheet)
-    run(toy.plan(toy.claim()), tmp_path)
+    judged(tmp_path, toy.claim())
     shown = {name: int(video.max()) for name, video in drawn[-1].others}
     assert shown == {"with": 20, "without": 3}
     assert (tmp_path / "out" / "figures" / "toy-clip.webp").exists()
     assert "(figures/toy-clip.webp)" in (tmp_path / "out" / "report.md").read_text()
     drawn.clear()
-    run(toy.plan(toy.claim("toy", ArmComparison("psnr", "with", "without", measurement="longer"))), tmp_path)
+    judged(tmp_path, toy.claim("toy", ArmComparison("psnr", "with", "without", measurement="policies")))
     assert not drawn  # the runs kept other frames than it compares
 
 
+@pytest.mark.usefixtures("cells")
 def test_a_figure_has_the_scores_that_the_claim_compares(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Tables of grids leave some of them out, such as Physics-IQ's; what was not measured has no panel."""
     drawn: list[str] = []
@@ -372,7 +360,7 @@ def test_a_figure_has_the_scores_that_the_claim_compares(tmp_path: Path, monkeyp
 
     monkeypatch.setattr(claim_tables, "draw", draw)
     compared = (ArmComparison(metric, "with", "without") for metric in ("psnr", "physics_iq_spatial", "ssim"))
-    run(toy.plan(toy.claim("toy", *compared)), tmp_path)
+    judged(tmp_path, toy.claim("toy", *compared))
     assert set(drawn) == {"psnr", "physics_iq_spatial"}
 
 
@@ -380,7 +368,3 @@ def test_mistakes_are_one_line(command: Commands) -> None:
     assert "not a duration" in command.refused("experiments.paper", "--budget", "long")
     assert "unknown preset" in command.refused("experiments.paper", "--preset", "tinny")
     assert "no such claim" in command.refused("experiments.paper", "--only", "table3")
-
-
-def test_the_sweep_of_an_ablation_still_runs_cells_itself() -> None:
-    assert sweep.run_cell.__module__ == sweep.run_sweep.__module__

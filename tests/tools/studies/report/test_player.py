@@ -20,7 +20,7 @@ def _tile(uri, number, size):
     return sheet[row * size : (row + 1) * size, column * size : (column + 1) * size]
 
 
-@pytest.mark.parametrize(("count", "sides"), [(1, (1, 1)), (2, (1, 2)), (7, (3, 3)), (16, (4, 4))])
+@pytest.mark.parametrize(("count", "sides"), [(2, (1, 2)), (7, (3, 3))])
 def test_a_sprite_holds_each_frame_once(count, sides):
     frames = np.random.default_rng(0).integers(0, 256, (count, 1, 1, 3), np.uint8).repeat(16, 1).repeat(16, 2)
     uri = sprite_uri(frames)
