@@ -32,7 +32,7 @@ accelerators: setup  ## compilers for GPUs and TPUs that are not here (5.1 GB), 
 	@scripts/accelerators.sh "$(VENV)"
 
 accelerators-test: accelerators  ## the tests that compile for them
-	@"$(VENV)/accelerators/bin/python" -m pytest tests/tools/compile $(ARGS)
+	@"$(VENV)/accelerators/bin/python" -m pytest $(in_parallel) tests/tools/compile $(ARGS)
 
 lint: setup  ## ruff, mypy, and the numbers that may only fall
 	@$(python) -m ruff check
