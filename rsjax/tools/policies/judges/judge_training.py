@@ -10,8 +10,9 @@ import numpy as np
 
 from rsjax.clip import Video
 from rsjax.config.fields import require_range
-from rsjax.data.clips import Clips, readable, spread
-from rsjax.data.store import Record, Store
+from rsjax.data.clips import Clips, first_clip, readable, spread
+from rsjax.data.state_labels import knows_success
+from rsjax.data.store import Record, Store, open_store
 from rsjax.errors import UserError
 from rsjax.files import write_json
 from rsjax.models.load_run import load
@@ -35,12 +36,12 @@ class JudgeSettings:
 
     Attributes:
         steps: training steps.
-        clips: training clips, at most.
-        reconstructed: how many of these clips the judge also sees as the tokenizer reconstructs them, so that it knows
-            the look of generated frames; their labels are the simulator's too.
-        generated: how many of these clips the judge also sees as the model generates them under their own actions. The
-            labels are the simulator's of the same actions: where the model lifts a cube that slipped in the simulator,
-            the judge learns to call it a failure.
+        clips: training clips of each store, at most.
+        reconstructed: how many of a store's clips the judge also sees as the tokenizer reconstructs them, so that it
+            knows the look of generated frames; their labels are the simulator's too.
+        generated: how many of a store's clips the judge also sees as the model generates them under their own actions.
+            The labels are the simulator's of the same actions: where the model lifts a cube that slipped in the
+            simulator, the judge learns to call it a failure.
         in_a_row: how many frames in a row must show success.
         validation_clips: held-out clips, at most.
         seed: seed of the training.
@@ -84,18 +85,26 @@ def judge_of(run: Path | str | TrainedModel, judge: Judge | Path | str | None, s
 
 
 def make_judge(
-    run: Path, data_dir: Path, store: Path | None = None, settings: JudgeSettings | None = None
+    run: Path,
+    data_dir: Path,
+    store: Path | None = None,
+    settings: JudgeSettings | None = None,
+    also: Sequence[Path] = (),
 ) -> dict[str, Any]:
     """Trains the judge of a run and returns its validation, which is also in ``RUN/judge/validation.json``.
 
+    Args:
+        also: stores whose training clips it learns from as well, such as clips of policies' own episodes.
+
     Raises:
-        UserError: the run or its clips are missing, or its clips do not show both success and failure.
+        UserError: the run or its clips are missing, its clips do not show both success and failure, or those of a store
+            in ``also`` have no label of success, or other pictures or actions than the run's.
     """
     settings = settings or JudgeSettings()
     trained = load(run)
     clips = _clips_of(trained, run, data_dir, store)
     test_clips = _held_out(clips, settings)
-    learned, fitted = _training(trained, clips, settings)
+    learned, fitted = _training(trained, [clips, *map(open_store, also)], settings)
     judge = replace(train_judge(learned, fitted, settings.steps, settings.seed), in_a_row=settings.in_a_row)
     result = validation(trained, judge, test_clips) | {"settings": vars(settings), "judge": judge.key}
     judge.save(run / FOLDER)
@@ -182,23 +191,38 @@ def _held_out(clips: Store, settings: JudgeSettings) -> list[Record]:
     return records
 
 
-def _training(trained: TrainedModel, clips: Store, settings: JudgeSettings) -> tuple[Footage, Footage]:
-    """Returns the videos to learn from and those to fit the temperature on: raw, reconstructed and generated ones."""
-    source = clips.source("train")
-    records = [clip for _, clip in readable(source, spread(source, settings.clips))]
-    if len(records) < 2:
-        raise UserError(f"{clips.path}: {len(records)} readable training clips; a judge needs 2 at least")
-    raw = Footage(*(np.stack([clip[name] for clip in records]) for name in ("rgb", "success")))
-    parts = [raw]
-    decoded = _reconstructed(trained, raw.rgb[: settings.reconstructed])
-    if decoded is not None:
-        parts.append(Footage(decoded, raw.success[: len(decoded)]))
-    if settings.generated:
-        some = Clips.stacked(records[: settings.generated], range(min(len(records), settings.generated)))
-        parts.append(Footage(imagined(trained, some).rgb, some.success))
-    numbers = np.concatenate([np.arange(len(part.rgb)) for part in parts])  # of the clips
+def _training(trained: TrainedModel, stores: Sequence[Store], settings: JudgeSettings) -> tuple[Footage, Footage]:
+    """Returns the videos to learn from and those to fit the temperature on: raw, reconstructed and generated ones.
+
+    Args:
+        stores: the run's own clips, and others.
+    """
+    own = first_clip(stores[0])
+    shapes = (own["rgb"].shape, own["actions"].shape)
+    parts = []
+    for clips in stores:
+        if clips is not stores[0] and not knows_success(clips):
+            raise UserError(f"{clips.path}: its clips do not say whether they succeed; a judge learns from such labels")
+        source = clips.source("train")
+        records = [clip for _, clip in readable(source, spread(source, settings.clips))]
+        if len(records) < 2:
+            raise UserError(f"{clips.path}: {len(records)} readable training clips; a judge needs 2 at least")
+        if (theirs := (records[0]["rgb"].shape, records[0]["actions"].shape)) != shapes:
+            raise UserError(
+                f"{clips.path}: the pictures and actions of its clips have the shapes {theirs}, those of the run's "
+                f"{shapes}; name clips of the run's length, size and actions"
+            )
+        raw = Footage(*(np.stack([clip[name] for clip in records]) for name in ("rgb", "success")))
+        parts.append(raw)
+        decoded = _reconstructed(trained, raw.rgb[: settings.reconstructed])
+        if decoded is not None:
+            parts.append(Footage(decoded, raw.success[: len(decoded)]))
+        if settings.generated:
+            some = Clips.stacked(records[: settings.generated], range(min(len(records), settings.generated)))
+            parts.append(Footage(imagined(trained, some).rgb, some.success))
+    numbers = np.concatenate([np.arange(len(part.rgb)) for part in parts])  # of a store's clips
     whole = Footage(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("rgb", "success")))
-    if len(raw.rgb) < FITTED:  # so few clips serve both purposes
+    if len(parts[0].rgb) < FITTED:  # so few clips serve both purposes
         return whole, whole
     fits = numbers % FITTED == FITTED - 1
     return Footage(whole.rgb[~fits], whole.success[~fits]), Footage(whole.rgb[fits], whole.success[fits])

@@ -10,6 +10,7 @@ import pytest
 
 from rsjax.clip import Video
 from rsjax.data.codec import decode, encode
+from rsjax.data.store import write_store
 from rsjax.errors import UserError
 from rsjax.tools.policies.judges import judge_training as judging
 from rsjax.tools.policies.judges import trained_judge as judge_module
@@ -198,6 +199,20 @@ def test_a_runs_judge_is_made_and_saved(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(judging, "train_judge", train)
     result = judging.make_judge(run, tmp_path, settings=judging.JudgeSettings(reconstructed=2))
     assert seen[0].rgb.shape[0] == toy.TRAIN + 2
+    settings = judging.JudgeSettings(reconstructed=2, generated=3)
+    judging.make_judge(run, tmp_path, settings=settings, also=[toy.store(tmp_path / "more").path])
+    assert seen[1].rgb.shape[0] == len(seen[1].success) == 2 * (toy.TRAIN + 2 + 3)
+    np.testing.assert_array_equal(*np.split(seen[1].rgb, 2))
+    records = [store.source("train")[number] for number in range(2)]
+    short = [record | {"rgb": record["rgb"][:-1]} for record in records]
+    for name, clips, meta, message in (
+        ("unlabelled", records, {}, "do not say whether they succeed"),
+        ("short", short, {"success_share": 0.5}, "name clips of the run's length, size and actions"),
+    ):
+        write_store(tmp_path / name, "clips", {"train": clips}, {"key": name, **meta})
+        with pytest.raises(UserError) as raised:
+            judging.make_judge(run, tmp_path, also=[tmp_path / name])
+        assert message in str(raised.value)
     assert {kind: np.sum(result[kind]["confusion"]) for kind in ("raw", "reconstructed", "generated")} == {
         "raw": 2 * toy.TEST * 5,
         "reconstructed": toy.TEST * 5,
