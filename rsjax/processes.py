@@ -194,14 +194,30 @@ class Helper(Generic[Item, Result]):
         self._worker = _start(pickle.dumps(make), [])
 
     def __call__(self, item: Item, seconds: float) -> Result:
-        """Returns an item's result.
+        """Returns an item's result. Raises what :meth:`send` and :meth:`receive` raise."""
+        self.send(item)
+        return self.receive(seconds)
+
+    def send(self, item: Item) -> None:
+        """Hands an item to the process, which works on it while this one goes on.
+
+        Raises:
+            WorkerDied: the process is gone.
+        """
+        try:
+            self._worker.pipe.send(item)
+        except OSError as error:
+            self.close()
+            raise WorkerDied from error
+
+    def receive(self, seconds: float) -> Result:
+        """Returns the result of the first item that was sent and not received.
 
         Raises:
             WorkerDied: the process is gone, or did not answer within ``seconds`` and was killed.
             Exception: whatever the work raised.
         """
         try:
-            self._worker.pipe.send(item)
             if not self._worker.pipe.poll(seconds):
                 raise EOFError
             succeeded, answer = self._worker.pipe.recv()

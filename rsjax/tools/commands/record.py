@@ -40,6 +40,7 @@ def main() -> None:
     if not options.policies or options.episodes < 1 or options.together < 1:
         raise ConfigError("name a policy at least, and --episodes and --together of 1 or more: --policies DIR")
     from rsjax.config import content_key
+    from rsjax.processes import count_cores
     from rsjax.tools.policies.on_policy import rollouts
     from rsjax.tools.policies.policy import common_size, load_policy
     from rsjax.tools.policies.run_data import RunData, named
@@ -53,7 +54,7 @@ def main() -> None:
     keys = str([policy.key for policy in policies.values()])
     together = min(options.together, options.episodes)  # what a policy draws depends on it
     folder = (options.out or options.run / "recorded") / content_key("recorded", 2, config, keys, total, together)
-    with closing(SimulatorWorld.lift(config, together)) as world:
+    with closing(SimulatorWorld.lift(config, together, count_cores())) as world:
         store = rollouts(policies, world, config, numbers, config.frames - 1, folder, "record")
     share = store.manifest["success_share"]
     print(f"{total} episodes, {100 * share:.0f} % end in success")

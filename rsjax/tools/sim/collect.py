@@ -5,7 +5,6 @@ are packed into one store. An episode on which the simulator fails is left out a
 """
 
 import functools
-import os
 import shutil
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
@@ -23,7 +22,7 @@ from rsjax.files import disk_guard, write_atomically
 from rsjax.processes import WorkerDied, count_cores, run_items
 from rsjax.tools.sim import metaworld
 from rsjax.tools.sim.episode import ENVIRONMENTS, EpisodePlan, Simulators, run_episode, source_name, task_of
-from rsjax.tools.sim.gl import GLError, choose_gl
+from rsjax.tools.sim.gl import GLError, choose_gl, share_cores
 from rsjax.tools.sim.recipes.plans import training_plans, versions
 
 # By simulator; raise when the same configuration gives different episodes.
@@ -134,8 +133,8 @@ def _simulate(
 
 
 def _open_simulator(config: SimConfig, partial: Path, workers: int) -> Callable[[EpisodePlan], None]:
-    """Opens a worker's simulators and limits Mesa's renderer to the worker's share of the cores."""
-    os.environ.setdefault("LP_NUM_THREADS", str(max(1, count_cores() // workers)))
+    """Opens a worker's simulators, which take its share of the cores."""
+    share_cores(workers)
     return functools.partial(_work, Simulators(config), config, partial)
 
 

@@ -5,6 +5,7 @@ import ctypes.util
 import os
 
 from rsjax.errors import UserError
+from rsjax.processes import count_cores
 
 LIBRARIES = {"egl": "EGL", "osmesa": "OSMesa"}  # in order of preference
 
@@ -44,3 +45,8 @@ def choose_gl() -> str:
         wanted = usable[0]
         os.environ["MUJOCO_GL"] = wanted
     return wanted
+
+
+def share_cores(workers: int) -> None:
+    """Limits Mesa's renderer in one of several worker processes to its share of the cores, unless the user set it."""
+    os.environ.setdefault("LP_NUM_THREADS", str(max(1, count_cores() // workers)))

@@ -16,6 +16,7 @@ from rsjax.config import SimConfig, content_key
 from rsjax.errors import UserError
 from rsjax.evaluation.statistics import Estimate, wilson
 from rsjax.files import write_file
+from rsjax.processes import count_cores
 from rsjax.progress import Progress
 from rsjax.tools.policies.policy import Policy
 from rsjax.tools.policies.worlds.model_world import FirstFrame, ModelWorld
@@ -38,7 +39,7 @@ class Trials:
     Attributes:
         episodes: episodes of each policy, from fixed seeds.
         max_steps: steps after which an episode counts as a failure.
-        together: episodes that run at a time.
+        together: episodes that run at a time; those in the simulator share all cores.
         videos: how many episodes are saved as videos.
     """
 
@@ -194,8 +195,8 @@ def repeat_actions(actions: Sequence[np.ndarray]) -> Actor:
 
 
 def open_lift(config: SimConfig, trials: Trials) -> AbstractContextManager[SimulatorWorld]:
-    """Opens the simulators that trials need, and closes them after the ``with`` block."""
-    return closing(SimulatorWorld.lift(config, min(trials.together, trials.episodes)))
+    """Opens the simulators that trials need, on all cores, and closes them after the ``with`` block."""
+    return closing(SimulatorWorld.lift(config, min(trials.together, trials.episodes), count_cores()))
 
 
 def first_frames(world: World, seeds: Sequence[int], file: Path) -> list[FirstFrame]:

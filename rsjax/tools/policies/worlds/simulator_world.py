@@ -6,9 +6,9 @@ One step is one frame at the clips' rate. An action is like a clip's: ``control_
 Axes: B episodes, S×S pixels, A = k·D action dimensions of k control steps.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from typing import Any, TypeAlias
+from functools import partial
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -16,12 +16,16 @@ from jaxtyping import Bool, Float
 from rsjax.config import SimConfig, content_key, require
 from rsjax.progress import note
 from rsjax.tools.policies.worlds.actions import PANDA_UNIT, ActionRange
+from rsjax.tools.policies.worlds.simulator_processes import (
+    Control,
+    Order,
+    Outcome,
+    SimulatorProcesses,
+    carry_out,
+)
 from rsjax.tools.policies.worlds.world import EpisodeRecord, WorldState
 from rsjax.tools.sim.episode import Simulator
-from rsjax.tools.sim.expert import LiftState
 from rsjax.tools.sim.lift import LiftSim
-
-Control: TypeAlias = Callable[[LiftState], Float[np.ndarray, " D"]]  # from the simulator's state, at each control step
 
 
 class SimulatorWorld:
@@ -30,49 +34,68 @@ class SimulatorWorld:
     An episode whose simulation diverges keeps its last state and does not succeed; a note says so.
 
     Args:
-        simulators: one for each episode.
+        simulators: one for each episode, in this process or in several.
         control_steps: k.
         width: D, the numbers of a control.
         key: a hash of the simulators' settings.
 
     Attributes:
+        simulators: those in this process.
         diverged: the errors of the episodes that diverged, by their numbers.
     """
 
     validation = None
 
-    def __init__(self, simulators: Sequence[Simulator], control_steps: int, width: int, key: str = "simulator") -> None:
-        self.simulators = list(simulators)
+    def __init__(
+        self,
+        simulators: Sequence[Simulator] | SimulatorProcesses,
+        control_steps: int,
+        width: int,
+        key: str = "simulator",
+    ) -> None:
+        self.simulators: list[Simulator] = []
+        self._processes: SimulatorProcesses | None = None
+        if isinstance(simulators, SimulatorProcesses):
+            self._processes = simulators
+        else:
+            self.simulators = list(simulators)
+        self.count = len(simulators)
         self.key = key
         self.diverged: dict[int, ArithmeticError] = {}
         self._controls = (control_steps, width)
         ones = np.ones(control_steps * width, np.float32)
         self.actions = ActionRange(-ones, ones, PANDA_UNIT)
-        self._views: list[Any] = []
-        self._success: list[bool] = []
+        self._states: dict[int, Outcome] = {}
 
     @classmethod
-    def lift(cls, config: SimConfig, count: int) -> "SimulatorWorld":
+    def lift(cls, config: SimConfig, count: int, workers: int = 1) -> "SimulatorWorld":
         """Opens ``count`` simulators of Lift with the camera, image size and control steps of clips.
+
+        Args:
+            workers: processes that simulate, at most one for each simulator. 1: this process; only there can
+                :class:`Control` act.
 
         Raises:
             GLError: no OpenGL context can be made.
             ConfigError: there is no such camera, or the clips are of another simulator.
+            UserError: a process died.
         """
         require(config.env == "lift", f"sim.env is {config.env}; only lift can be acted in so far")
-        with ExitStack() as opened:
-            simulators = [opened.enter_context(LiftSim(config.camera, config.image_size)) for _ in range(count)]
-            opened.pop_all()
-        return cls(
-            simulators, config.control_steps, config.action_dim // config.control_steps, content_key("lift", config)
-        )
-
-    @property
-    def count(self) -> int:
-        return len(self.simulators)
+        opener = partial(LiftSim, config.camera, config.image_size)
+        simulators: Sequence[Simulator] | SimulatorProcesses
+        if min(workers, count) > 1:
+            simulators = SimulatorProcesses(opener, count, min(workers, count))
+        else:
+            with ExitStack() as opened:
+                simulators = [opened.enter_context(opener()) for _ in range(count)]
+                opened.pop_all()
+        controls = (config.control_steps, config.action_dim // config.control_steps)
+        return cls(simulators, *controls, content_key("lift", config))
 
     def close(self) -> None:
         """Frees the renderers and the simulations."""
+        if self._processes:
+            self._processes.close()
         for simulator in self.simulators:
             simulator.close()
 
@@ -80,14 +103,14 @@ class SimulatorWorld:
         """Begins an episode from each seed (0 … 2³² - 1), which determines the arm's start and the cube's place."""
         if which is None:
             self.diverged = {}
-            self._views = [None] * len(starts)
-            self._success = [False] * len(starts)
+            self._states = {}
             which = np.ones(len(starts), bool)
-        for number, seed in zip(np.flatnonzero(which).tolist(), starts, strict=True):
+        orders = dict(zip(np.flatnonzero(which).tolist(), map(int, starts), strict=True))
+        for number in orders:
             self.diverged.pop(number, None)
-            self.simulators[number].reset(int(seed))
-            self._look(number)
-        return self._state(np.zeros((len(self._views), *self._controls), np.float32), np.zeros(len(self._views), int))
+        self._carry_out(orders)
+        count = len(self._states)
+        return self._state(np.zeros((count, *self._controls), np.float32), np.zeros(count, int))
 
     def step(
         self, actions: Float[np.ndarray, "B A"] | Sequence[Control], ignored: Bool[np.ndarray, " B"] | None = None
@@ -99,44 +122,48 @@ class SimulatorWorld:
 
         Raises:
             ActionError: the actions have the wrong shape, or a value that is not finite.
+            UserError: a process of the simulator died.
         """
-        count = len(self._views)
+        count = len(self._states)
+        acting = [n for n in range(count) if n not in self.diverged and (ignored is None or not ignored[n])]
         controls = np.zeros((count, *self._controls), np.float32)
         clipped = np.zeros(count, int)
-        scripted = isinstance(actions, list) and all(map(callable, actions))
-        if not scripted:
+        orders: dict[int, Order]
+        if isinstance(actions, list) and all(map(callable, actions)):
+            require(not self._processes, "functions act only in simulators of this process: SimulatorWorld.lift(…, 1)")
+            orders = {number: [actions[number]] * self._controls[0] for number in acting}
+        else:
             rows, outside = self.actions.clip(actions, count, ignored=ignored)
-            controls = rows.reshape(controls.shape)
-            clipped = outside.sum(1)
-        for number, simulator in enumerate(self.simulators[:count]):
-            if number in self.diverged or (ignored is not None and ignored[number]):
-                controls[number] = 0
-                clipped[number] = 0
-                continue
-            try:
-                for control in controls[number]:
-                    if scripted:
-                        control[:] = actions[number](simulator.state)  # type: ignore[operator]
-                    simulator.step(control)
-            except ArithmeticError as error:
-                note(f"{error}; the episode stays as it was, and does not succeed")
-                self.diverged[number] = error
-                controls[number] = 0
+            orders = {number: rows[number].reshape(self._controls) for number in acting}
+            clipped[acting] = outside[acting].sum(1)
+        self._carry_out(orders)
+        for number in acting:
+            if number in self.diverged:
                 clipped[number] = 0
             else:
-                self._look(number)
+                controls[number] = self._states[number].controls
         return self._state(controls, clipped)
 
     def unfamiliarity(self, episodes: Sequence[EpisodeRecord], frames: int) -> list[float]:
         return []
 
-    def _look(self, number: int) -> None:
-        self._views[number] = self.simulators[number].render()
-        self._success[number] = bool(self.simulators[number].success)
+    def _carry_out(self, orders: Mapping[int, Order]) -> None:
+        if self._processes:
+            outcomes = self._processes(orders)
+        else:
+            outcomes = {number: carry_out(self.simulators[number], order) for number, order in orders.items()}
+        for number, outcome in outcomes.items():
+            if isinstance(outcome, Outcome):
+                self._states[number] = outcome
+            else:
+                note(f"{outcome}; the episode stays as it was, and does not succeed")
+                self.diverged[number] = outcome
 
     def _state(self, controls: Float[np.ndarray, "B k D"], clipped: np.ndarray) -> WorldState:
+        states = [self._states[number] for number in range(len(self._states))]
         observation = {
-            "rgb": np.stack([view.rgb for view in self._views]),
-            "depth": np.stack([view.depth for view in self._views]),
+            "rgb": np.stack([state.rgb for state in states]),
+            "depth": np.stack([state.depth for state in states]),
         }
-        return WorldState(observation, np.array(self._success), controls.reshape(len(controls), -1), clipped)
+        success = np.array([state.success for state in states])
+        return WorldState(observation, success, controls.reshape(len(controls), -1), clipped)

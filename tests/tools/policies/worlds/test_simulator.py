@@ -1,3 +1,4 @@
+import multiprocessing
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
@@ -68,6 +69,35 @@ def test_the_expert_lifts_and_its_actions_lift_again(gl: str) -> None:
     assert first.success[-1] and not first.success[:-1].any()
     np.testing.assert_array_equal(first.rgb, again.rgb)
     assert again.success[-1]
+
+
+def test_simulators_in_processes_do_what_those_in_this_process_do(gl: str) -> None:
+    rng = np.random.default_rng(0)
+    rows = rng.uniform(-1.2, 1.2, (2, 3, CONFIG.action_dim))
+    ignored = np.array([False, True, False])
+    again = np.array([False, True, False])
+    with closing(SimulatorWorld.lift(CONFIG, 3)) as here, closing(SimulatorWorld.lift(CONFIG, 3, 2)) as elsewhere:
+        assert not elsewhere.simulators and elsewhere.count == here.count and elsewhere.key == here.key
+        for world_call in (
+            lambda world: world.reset([1, 2, 3]),
+            lambda world: world.step(rows[0]),
+            lambda world: world.step(rows[1], ignored=ignored),
+            lambda world: world.reset([4], which=again),
+            lambda world: world.reset([5, 6]),
+            lambda world: world.step(rows[0, :2]),
+        ):
+            one, other = world_call(here), world_call(elsewhere)
+            for name in ("rgb", "depth"):
+                np.testing.assert_array_equal(one.observation[name], other.observation[name])
+            for name in ("success", "actions", "clipped"):
+                np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+        with pytest.raises(UserError) as raised:
+            elsewhere.step([skilled_expert(0).act] * 2)
+        assert "functions act only in simulators of this process" in str(raised.value)
+        multiprocessing.active_children()[0].kill()
+        with pytest.raises(UserError) as raised:
+            elsewhere.step(rows[0, :2])
+        assert "a process of the simulator died" in str(raised.value)
 
 
 def test_another_simulator_is_refused() -> None:
