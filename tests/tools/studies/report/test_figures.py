@@ -50,6 +50,20 @@ def test_animation_has_every_frame_and_row(make_clip):
     assert (bar == bar[0]).all()
 
 
+def test_prompt_frames_and_depths_without_a_unit_are_labelled(make_clip):
+    clip = make_clip()
+    second = filmstrip_cell(clip, 0, 1)
+    below = filmstrip_cell(clip, len(clip.rows()), 0)[0]
+    plain = filmstrip(clip)
+    rows, columns = np.nonzero((filmstrip(make_clip(prompt_frames=2)) != plain).any(-1))
+    assert rows.max() < second[0]
+    assert second[1] <= columns.min() < columns.max() < filmstrip_cell(clip, 0, 2)[1]
+    rows, _ = np.nonzero((filmstrip(make_clip(depth_unit="relative")) != plain).any(-1))
+    assert rows.min() >= below
+    changed = (np.asarray(animation(make_clip(prompt_frames=2))) != np.asarray(animation(clip))).any((1, 2, 3))
+    assert changed.tolist() == [False, True, False, False, False, False]
+
+
 def test_missing_rows_are_left_out(make_clip):
     bare = make_clip(reconstruction=None, other_actions=None, true_depth=None, predicted_depth=None)
     assert [label for label, _ in bare.rows()] == ["truth", "prediction"]

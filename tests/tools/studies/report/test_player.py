@@ -47,6 +47,9 @@ def test_a_clip_of_the_player_has_its_rows_in_order_and_its_scores(make_clip):
     assert scores["prediction"][:2] == [None, None]
     np.testing.assert_allclose(scores["prediction"][2:], psnr(clip.truth, clip.prediction)[2:], atol=0.01)
     assert (data["depth"]["near"], data["depth"]["far"]) == ("1 m", "2 m")
+    without_unit = player_clip(make_clip(depth_unit="relative"))["depth"]
+    assert (without_unit["near"], without_unit["far"]) == ("1", "2 (no unit)")
+    assert data["prompt"] == 2
     bare = player_clip(make_clip(true_depth=None, predicted_depth=None))
     assert bare["depth"] is None and bare["label"] == bare["title"] == "episode <7>"
 
