@@ -22,7 +22,7 @@ class Options(JudgeSettings):
     store: Path | None = None
     """The new path of the run's store of ingested clips, if it was moved."""
     also: tuple[Path, ...] = ()
-    """More stores of clips to learn from, such as runs/tiny-adapted/on-policy-1/clips, of policies' own episodes."""
+    """More stores of clips to learn from, such as policies' episodes (rsjax record); --head matches their rate."""
     head: bool = False
     """Train nothing, but validate the model's own success head as a judge (--model.state-heads on)."""
 
@@ -39,12 +39,12 @@ def main() -> None:
 
     run = with_clips(options.run)
     settings = part(options, JudgeSettings)
+    make = judge_training.make_judge
+    folder = judge_training.FOLDER
     if options.head:
+        make = judge_training.validate_heads
         folder = head_judge.FOLDER
-        result = judge_training.validate_heads(run, options.data_dir, options.store, settings)
-    else:
-        folder = judge_training.FOLDER
-        result = judge_training.make_judge(run, options.data_dir, options.store, settings, options.also)
+    result = make(run, options.data_dir, options.store, settings, options.also)
     print(f"judge on {result['clips']} held-out clips: frames by label\n\n{as_markdown(confusion_table(result))}\n")
     if whole := whole_clips(result):
         print(f"whole clips, by how many frames in a row must show success\n\n{as_markdown(whole)}\n")

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
+from scipy.special import expit, logit
 
 from rsjax.config import ModelConfig
 from rsjax.config.fields import require_range
@@ -32,10 +33,12 @@ class HeadJudge:
     Attributes:
         in_a_row: how many frames in a row must show success.
         validation: the content of its ``validation.json``, if it was validated.
+        shift: added to the logit of success (:func:`matching_shift`).
     """
 
     in_a_row: int = 1
     validation: dict[str, Any] | None = None
+    shift: float = 0.0
 
     def __post_init__(self) -> None:
         require_range(self, "judge", 1, 16, "in_a_row")
@@ -43,7 +46,8 @@ class HeadJudge:
     @property
     def key(self) -> str:
         """A name of all that verdicts depend on besides the model."""
-        return f"{NAME}, {self.in_a_row} in a row"
+        shifted = f", logits {self.shift:+g}" if self.shift else ""
+        return f"{NAME}, {self.in_a_row} in a row{shifted}"
 
     def read(self, state: Float[np.ndarray, "B T 3"]) -> Float[np.ndarray, "B 3"]:
         """Returns the probability of each of ``LABELS`` at the end of each video.
@@ -53,10 +57,27 @@ class HeadJudge:
                 no reading (NaN) and show no success.
         """
         success = np.nan_to_num(state[:, -self.in_a_row :, STATE.index("success")])
+        if self.shift:
+            success = expit(logit(success) + self.shift)
         verdicts = np.zeros((self.in_a_row, len(success), len(LABELS)))
         verdicts[..., SUCCESS] = success.T
         verdicts[..., FAIL] = 1 - success.T
         return all_successes(verdicts)
+
+
+def matching_shift(state: Float[np.ndarray, "B T 3"], success: Bool[np.ndarray, "B T"], in_a_row: int) -> float:
+    """Returns the shift of the logit of success with which the head calls as many videos a success as truly are one.
+
+    Args:
+        state: as of :class:`rsjax.clip.Video`, of generated frames.
+        success: what the simulator says of the same frames.
+    """
+    single = [HeadJudge().read(state[:, : t + 1]) for t in range(state.shape[1])]
+    rows = [all_successes(np.stack(single[max(0, t + 1 - in_a_row) : t + 1]))[:, SUCCESS] for t in range(len(single))]
+    likely = np.sort(logit(np.clip(np.max(rows, axis=0), 1e-6, 1 - 1e-6)))[::-1]  # of each video, the likeliest first
+    true = int(success.any(axis=1).sum())
+    edges = np.concatenate([[likely[0] + 1], likely, [likely[-1] - 1]])
+    return -float(edges[true : true + 2].mean())
 
 
 def check_heads(model: ModelConfig, where: str) -> None:
@@ -81,7 +102,8 @@ def head_judge(trained: TrainedModel, run: Path | None = None) -> HeadJudge:
     check_heads(trained.config.model, "the model" if run is None else str(run))
     if run is None or not (run / FOLDER / VALIDATION).exists():
         return HeadJudge()
-    return HeadJudge(frames_in_a_row(run), _validation(run))
+    validation = _validation(run)
+    return HeadJudge(frames_in_a_row(run), validation, float(validation.get("shift", 0.0)))
 
 
 def frames_in_a_row(run: Path) -> int:

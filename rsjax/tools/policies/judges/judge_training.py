@@ -17,11 +17,11 @@ from rsjax.errors import UserError
 from rsjax.files import write_json
 from rsjax.models.load_run import load
 from rsjax.models.trained import TrainedModel
-from rsjax.progress import Progress
+from rsjax.progress import Progress, note
 from rsjax.tools.pipeline.run import Run
 from rsjax.tools.pipeline.run_clips import relocated
 from rsjax.tools.policies.judges.head_judge import FOLDER as HEAD_FOLDER
-from rsjax.tools.policies.judges.head_judge import HeadJudge, head_judge
+from rsjax.tools.policies.judges.head_judge import HeadJudge, head_judge, matching_shift
 from rsjax.tools.policies.judges.judge import FAIL, LABELS, SUCCESS, Judge
 from rsjax.tools.policies.judges.trained_judge import VALIDATION, Footage, load_judge, train_judge
 from rsjax.tools.policies.judges.validation import outcomes, scores, validate
@@ -125,18 +125,38 @@ def validation(trained: TrainedModel, judge: Judge, clips: Sequence[Record]) -> 
 
 
 def validate_heads(
-    run: Path, data_dir: Path, store: Path | None = None, settings: JudgeSettings | None = None
+    run: Path,
+    data_dir: Path,
+    store: Path | None = None,
+    settings: JudgeSettings | None = None,
+    also: Sequence[Path] = (),
 ) -> dict[str, Any]:
     """Validates a model's own success head as a judge, and writes the result to ``RUN/judge_head/validation.json``.
 
+    Args:
+        also: stores of clips, of which the model generates ``settings.clips`` each; the head's logit is shifted so that
+            it calls as many of them a success as the simulator does.
+
     Raises:
-        UserError: the run or its clips are missing, or the model has no state heads.
+        UserError: the run or its clips are missing, the model has no state heads, or the clips of a store in ``also``
+            do not fit, as for :func:`make_judge`.
     """
     settings = settings or JudgeSettings()
     trained = load(run)
     head_judge(trained, run)
-    test_clips = _held_out(_clips_of(trained, run, data_dir, store), settings)
-    result = head_validation(trained, HeadJudge(settings.in_a_row), test_clips) | {"settings": vars(settings)}
+    own = _clips_of(trained, run, data_dir, store)
+    test_clips = _held_out(own, settings)
+    shift = 0.0
+    if also:
+        first = trained.config.prompt_frames
+        records = [record for path in also for record in _labelled(open_store(path), own, settings.clips)]
+        batch = Clips.stacked(records, range(len(records)))
+        made = imagined(trained, batch).frames(first)
+        assert made.state is not None
+        shift = matching_shift(made.state, batch.success[:, first:], settings.in_a_row)
+        note(f"the head's logit of success is shifted by {shift:+.2f}, to match the rate of {len(records)} clips")
+    judge = HeadJudge(settings.in_a_row, shift=shift)
+    result = head_validation(trained, judge, test_clips) | {"settings": vars(settings), "shift": shift}
     write_json(run / HEAD_FOLDER / VALIDATION, result)
     return result
 
@@ -153,7 +173,7 @@ def head_validation(trained: TrainedModel, judge: HeadJudge, clips: Sequence[Rec
     result: dict[str, Any] = {"clips": len(clips), "judge": judge.key, "in_a_row": judge.in_a_row}
     for kind, state in (("raw", forced.state), ("generated", made.state)):
         each = [judge.read(state[:, : t + 1]) for t in range(state.shape[1])]
-        single = [HeadJudge().read(state[:, : t + 1]) for t in range(state.shape[1])]
+        single = [replace(judge, in_a_row=1).read(state[:, : t + 1]) for t in range(state.shape[1])]
         result[kind] = scores(np.stack(each, 1).reshape(-1, len(LABELS)), truth)
         result[kind]["whole_clips"] = outcomes(np.stack(single), success)
     return result
@@ -191,27 +211,32 @@ def _held_out(clips: Store, settings: JudgeSettings) -> list[Record]:
     return records
 
 
+def _labelled(clips: Store, own: Store, count: int) -> list[Record]:
+    """Returns at most ``count`` training clips of a store, which must be labelled and like the run's ``own``."""
+    if clips is not own and not knows_success(clips):
+        raise UserError(f"{clips.path}: its clips do not say whether they succeed; a judge learns from such labels")
+    source = clips.source("train")
+    records = [clip for _, clip in readable(source, spread(source, count))]
+    if len(records) < 2:
+        raise UserError(f"{clips.path}: {len(records)} readable training clips; a judge needs 2 at least")
+    theirs, ours = ((clip["rgb"].shape, clip["actions"].shape) for clip in (records[0], first_clip(own)))
+    if theirs != ours:
+        raise UserError(
+            f"{clips.path}: the pictures and actions of its clips have the shapes {theirs}, those of the run's {ours}; "
+            f"name clips of the run's length, size and actions"
+        )
+    return records
+
+
 def _training(trained: TrainedModel, stores: Sequence[Store], settings: JudgeSettings) -> tuple[Footage, Footage]:
     """Returns the videos to learn from and those to fit the temperature on: raw, reconstructed and generated ones.
 
     Args:
         stores: the run's own clips, and others.
     """
-    own = first_clip(stores[0])
-    shapes = (own["rgb"].shape, own["actions"].shape)
     parts = []
     for clips in stores:
-        if clips is not stores[0] and not knows_success(clips):
-            raise UserError(f"{clips.path}: its clips do not say whether they succeed; a judge learns from such labels")
-        source = clips.source("train")
-        records = [clip for _, clip in readable(source, spread(source, settings.clips))]
-        if len(records) < 2:
-            raise UserError(f"{clips.path}: {len(records)} readable training clips; a judge needs 2 at least")
-        if (theirs := (records[0]["rgb"].shape, records[0]["actions"].shape)) != shapes:
-            raise UserError(
-                f"{clips.path}: the pictures and actions of its clips have the shapes {theirs}, those of the run's "
-                f"{shapes}; name clips of the run's length, size and actions"
-            )
+        records = _labelled(clips, stores[0], settings.clips)
         raw = Footage(*(np.stack([clip[name] for clip in records]) for name in ("rgb", "success")))
         parts.append(raw)
         decoded = _reconstructed(trained, raw.rgb[: settings.reconstructed])

@@ -14,7 +14,7 @@ from rsjax.config import StateHeadsConfig
 from rsjax.errors import UserError
 from rsjax.files import write_json
 from rsjax.models.base import TeacherForced
-from rsjax.tools.policies.judges.head_judge import HeadJudge, frames_in_a_row, head_judge
+from rsjax.tools.policies.judges.head_judge import HeadJudge, frames_in_a_row, head_judge, matching_shift
 from rsjax.tools.policies.judges.judge import FAIL, SUCCESS, all_successes
 from rsjax.tools.policies.judges.judge_training import head_validation
 from rsjax.tools.policies.judges.trained_judge import Footage
@@ -54,6 +54,21 @@ def test_a_head_judges_by_the_last_frames_that_it_read() -> None:
         head_judge(SimpleNamespace(config=toy.config()), Path("runs/a"))  # type: ignore[arg-type]
     assert "runs/a: has no state heads" in str(caught.value)
     assert "--model.state-heads on" in str(caught.value)
+
+
+@pytest.mark.parametrize("in_a_row", [1, 2])
+@pytest.mark.parametrize("true", [0, 7, 20])
+def test_a_shifted_head_calls_as_many_videos_a_success_as_truly_are_one(in_a_row: int, true: int) -> None:
+    rng = np.random.default_rng(true)
+    state = np.concatenate([state_of(p) for p in rng.random((20, 6))])
+    success = np.zeros((20, 6), bool)
+    success[rng.permutation(20)[:true], 3] = True
+    judge = HeadJudge(in_a_row, shift=matching_shift(state, success, in_a_row))
+    called = np.zeros(20, bool)
+    for t in range(6):
+        called |= judge.read(state[:, : t + 1]).argmax(-1) == SUCCESS
+    assert called.sum() == true
+    assert judge.key != HeadJudge(in_a_row).key
 
 
 def test_whole_clips_succeed_where_some_frame_does() -> None:
@@ -148,6 +163,8 @@ def test_heads_are_validated_on_true_frames_and_on_rollouts(tmp_path: Path) -> N
     assert result["raw"]["right"][0] == 0
     assert result["generated"]["right"][0] == pytest.approx(1 - 2 / success[:, 1:].size)  # the first frames of success
     assert result["generated"]["whole_clips"]["1"]["right"][0] == 1
+    write_json(tmp_path / "judge_head" / "validation.json", result | {"shift": -0.5})
+    assert head_judge(trained, tmp_path).shift == -0.5
     write_json(tmp_path / "judge_head" / "validation.json", result)
     assert head_judge(trained, tmp_path) == HeadJudge(2, json.loads(json.dumps(result)))
     assert (frames_in_a_row(tmp_path), frames_in_a_row(tmp_path / "elsewhere")) == (2, 1)
