@@ -8,7 +8,7 @@ Axes: B clips, T frames, H×W pixels, A action dimensions, R draws of random act
 """
 
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -176,26 +176,27 @@ def evaluate(
     if coverage is not None and predicted_tokens is not None and predicted_tokens.features is not None:
         distances = coverage.distances(predicted_tokens.features, clips.actions[:, protocol.prompt_frames :])
         familiarity = Familiarity(*coverage.of_clips(distances.mean(1)))
-    repetitions: list[ClipScores] = []
-    curves: list[Curves] = []
-    for run in range(protocol.repetitions):
-        scenes = make_scenes(
-            generation.trained,
-            protocol,
-            clips,
-            generation.videos(run),
-            estimator,
-            locate,
-            predicted_tokens,
-            eval_clips.retakes,
-            familiarity,
-        )
-        scenes = with_probes(scenes, probed)
-        scored = score_all(scenes, protocol, trained.config.model.takes_actions)
-        repetitions.append(with_best(scored, scenes[""], generation.samples(run), protocol))
-        curves.append(frame_curves(scenes))
-        if run == 0:
-            first = scenes
+    takes_actions = trained.config.model.takes_actions
+    first = make_scenes(
+        generation.trained,
+        protocol,
+        clips,
+        generation.videos(0),
+        estimator,
+        locate,
+        predicted_tokens,
+        eval_clips.retakes,
+        familiarity,
+    )
+    first = with_probes(first, probed)
+    scored = score_all(first, protocol, takes_actions)
+    repetitions = [with_best(scored, first[""], generation.samples(0), protocol)]
+    curves = [frame_curves(first)]
+    for run in range(1, protocol.repetitions):
+        scene = next_scene(first[""], generation.videos(run), protocol, estimator, locate)
+        again = with_baselines_of(scored, score_all({"": scene}, protocol, takes_actions), first)
+        repetitions.append(with_best(again, scene, generation.samples(run), protocol))
+        curves.append(frame_curves(first | {"": scene}))
 
     scored = mean_scores(repetitions)
     per_clip = scored.per_clip()
@@ -292,13 +293,42 @@ def make_scenes(
         )
         if locate is not None:
             scenes[suffix] = replace(scenes[suffix], located=locate(shown[suffix], suffix == ""))
-    alternatives = {
-        kind: [scaled(video, protocol.resolution) for video in draws] for kind, draws in videos.items() if kind != OWN
-    }
     scenes[""] = replace(
-        scenes[""], alternatives=alternatives, teacher_forced=predicted_tokens, familiarity=familiarity
+        scenes[""],
+        alternatives=other_videos(videos, protocol),
+        teacher_forced=predicted_tokens,
+        familiarity=familiarity,
     )
     return scenes
+
+
+def next_scene(
+    first: Scene,
+    videos: Mapping[str, Sequence[Video]],
+    protocol: Protocol,
+    estimator: DepthEstimator | None,
+    locate: Locate | None,
+) -> Scene:
+    """Returns the scene of another repetition's prediction; the baselines' are the same in all repetitions.
+
+    Args:
+        first: that of the first repetition's prediction.
+        videos: of the repetition, as for :func:`make_scenes`.
+    """
+    made = videos[OWN][0]
+    prediction = scaled(made, protocol.resolution)
+    scene = replace(first, prediction=prediction, alternatives=other_videos(videos, protocol))
+    if estimator is not None:
+        scene = replace(scene, estimated=estimate_depth(estimator, first.truth.rgb, {"": prediction.rgb})[""])
+    if locate is not None:
+        scene = replace(scene, located=locate(made, True))
+    return scene
+
+
+def other_videos(videos: Mapping[str, Sequence[Video]], protocol: Protocol) -> dict[str, list[Video]]:
+    """Returns the videos under other actions than the clips' own, as they are compared."""
+    others = {kind: draws for kind, draws in videos.items() if kind != OWN}
+    return {kind: [scaled(video, protocol.resolution) for video in draws] for kind, draws in others.items()}
 
 
 def scored_frames(
@@ -413,6 +443,21 @@ def score_all(scenes: Mapping[str, Scene], protocol: Protocol, takes_actions: bo
         except Unavailable as reason:
             reasons[metric.name] = str(reason)
     return ClipScores(values, reasons, {})
+
+
+def with_baselines_of(known: ClipScores, scored: ClipScores, suffixes: Iterable[str]) -> ClipScores:
+    """Adds the baselines' scores of another repetition to those of a prediction alone.
+
+    Args:
+        known: the other repetition's.
+        suffixes: of the scores' names, "" for the prediction.
+    """
+    values = {}
+    for metric, own in scored.values.items():
+        starts = tuple(f"{metric}{suffix}" for suffix in suffixes if suffix)
+        theirs = {name: each for name, each in known.values.get(metric, {}).items() if name.startswith(starts)}
+        values[metric] = theirs | dict(own)
+    return replace(scored, values=values)
 
 
 def _score(metric: Metric, scenes: Mapping[str, Scene], protocol: Protocol) -> dict[str, PerClip]:

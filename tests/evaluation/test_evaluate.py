@@ -240,6 +240,9 @@ def test_repetitions_are_averaged_and_draw_differently(clips: Store, tmp_path: P
     first, second = (each["psnr"] for each in found.repetitions)
     assert first != second
     assert found.metrics["psnr"] == found.metrics["psnr_n1_pred_only"] == pytest.approx((first + second) / 2)
+    one, other = found.repetitions
+    assert one.keys() == other.keys() and {"psnr_tokenizer", "ssim_repeat_first"} <= one.keys()
+    assert all(one[name] == other[name] for name in one if "_tokenizer" in name or "_repeat_first" in name)
     assert "generates no videos under other actions" in found.reasons["delta_psnr"]
     assert found.reasons.keys() >= PROBED
     eval_clips = EvaluationClips.read(clips, "test", protocol, SAMPLED.clips)
