@@ -1,7 +1,7 @@
 """Settings of the families that predict tokens, RoboScape and Genie: masking, sampling, losses and the network."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
 from rsjax.config.data import ClipShape
@@ -192,6 +192,11 @@ class SampleConfig:
         for name in ("temperature", "top_k", "window_stride"):
             value = getattr(self, name)
             require(value >= 0, f"model.sample.{name} is {value}; it cannot be negative")
+
+    @property
+    def compiled(self) -> "SampleConfig":
+        """The settings without those that change no compiled program."""
+        return replace(self, seed=0, keep_still=None)
 
     @property
     def shows_means(self) -> bool:

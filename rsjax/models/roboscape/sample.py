@@ -487,7 +487,7 @@ def rollout(
     program = _rollout if cached else _recomputed
     keys = _clip_keys(key, index, clips)
     rows = _padded(arch, actions, frames)
-    made = program(arch, replace(sample, seed=0), params, tokens, no_depth, rows, jnp.asarray(frames), keys, resting)
+    made = program(arch, sample.compiled, params, tokens, no_depth, rows, jnp.asarray(frames), keys, resting)
     return {branch: grid[:, :frames] for branch, grid in made.items()}
 
 
@@ -513,7 +513,7 @@ def encode_prompt(
     """
     arch.check_sampling(sample)
     tokens, no_depth = _prompt_tokens(arch, prompt, no_depth)
-    state = _start(arch, replace(sample, seed=0), params, tokens, actions, None, no_depth, resting)
+    state = _start(arch, sample.compiled, params, tokens, actions, None, no_depth, resting)
     return Prompt(tokens, state, _cache_settings(arch, sample))
 
 
@@ -553,7 +553,7 @@ def rollout_from(
         raise ValueError(f"a prompt of {clips} clips and {len(actions)} action sequences; give one prompt, or as many")
     keys = _clip_keys(key, index, len(actions))
     rows = _padded(arch, actions, frames)
-    made = _continue(arch, replace(sample, seed=0), params, prompt, rows, jnp.asarray(frames), keys)
+    made = _continue(arch, sample.compiled, params, prompt, rows, jnp.asarray(frames), keys)
     return {branch: grid[:, :frames] for branch, grid in made.items()}
 
 

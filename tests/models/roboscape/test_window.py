@@ -1,5 +1,6 @@
 """Rollouts longer than the window."""
 
+import itertools
 from dataclasses import replace
 from typing import Any
 
@@ -9,7 +10,7 @@ import pytest
 from hypothesis import given as drawn
 from hypothesis import strategies as st
 
-from rsjax.config import SampleConfig
+from rsjax.config import KeepStillConfig, SampleConfig
 from rsjax.data.normalization import Normalization
 from rsjax.models.roboscape import sample as module
 from rsjax.models.roboscape.architecture import Architecture
@@ -104,14 +105,16 @@ def test_a_longer_rollout_is_no_larger_a_program(rotary: bool, beyond: int, monk
 
 
 def test_lengths_up_to_one_multiple_of_the_window_are_one_program_and_the_next_is_another() -> None:
+    """Whatever the seed, and whether pictures are mixed with the first one after decoding."""
+    mixing = (None, KeepStillConfig())
     model = replace(RGB, width=20)  # a model of this test alone
     params, (tokens, actions) = random_params(model), given(model, 1, 12)
     compiled: Any = module._rollout
     before = compiled._cache_size()
     for lengths, programs in (((6, 5, 2), 1), ((12, 11, 7), 2)):
         made = [
-            rollout(model, SampleConfig(seed=frames), params, tokens, actions[:, :frames], KEY)["rgb"]
-            for frames in lengths
+            rollout(model, SampleConfig(seed=frames, keep_still=still), params, tokens, actions[:, :frames], KEY)["rgb"]
+            for frames, still in zip(lengths, itertools.cycle(mixing), strict=False)
         ]
         for frames, short in zip(lengths, made, strict=True):
             np.testing.assert_array_equal(short, made[0][:, :frames])

@@ -202,7 +202,8 @@ def test_a_runs_judge_is_made_and_saved(tmp_path: Path, monkeypatch: pytest.Monk
     settings = judging.JudgeSettings(reconstructed=2, generated=3)
     judging.make_judge(run, tmp_path, settings=settings, also=[toy.store(tmp_path / "more").path])
     assert seen[1].rgb.shape[0] == len(seen[1].success) == 2 * (toy.TRAIN + 2 + 3)
-    np.testing.assert_array_equal(*np.split(seen[1].rgb, 2))
+    ours, theirs = np.split(seen[1].rgb, 2)
+    np.testing.assert_array_equal(ours, theirs)
     records = [store.source("train")[number] for number in range(2)]
     short = [record | {"rgb": record["rgb"][:-1]} for record in records]
     for name, clips, meta, message in (
