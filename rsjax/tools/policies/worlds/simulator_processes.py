@@ -80,7 +80,11 @@ class SimulatorProcesses:
         for worker in range(workers):
             share = range(worker, count, workers)
             self._helpers.append(Helper(functools.partial(open_share, opener, share, workers)))
-        self({})  # raises what opening raises
+        try:
+            self({})  # raises what opening raises
+        except BaseException:
+            self.close()
+            raise
 
     def __len__(self) -> int:
         return self._count

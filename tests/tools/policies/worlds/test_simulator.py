@@ -98,6 +98,9 @@ def test_simulators_in_processes_do_what_those_in_this_process_do(gl: str) -> No
         with pytest.raises(UserError) as raised:
             elsewhere.step(rows[0, :2])
         assert "a process of the simulator died" in str(raised.value)
+    with pytest.raises(ConfigError):
+        SimulatorWorld.lift(replace(CONFIG, camera="nowhere"), 2, 2)
+    assert not multiprocessing.active_children()
 
 
 def test_another_simulator_is_refused() -> None:
