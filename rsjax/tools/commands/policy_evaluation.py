@@ -54,7 +54,7 @@ def main() -> None:
         raise ConfigError(
             "name a run directory at least, --checkpoints 2 or more, --trainings 1 or more: policy_evaluation runs/tiny"
         )
-    from rsjax.tools.policies.judges.head_judge import frames_in_a_row
+    from rsjax.tools.policies.judges.head_judge import head_rule
     from rsjax.tools.policies.judges.judge_training import FOLDER
     from rsjax.tools.policies.policy import common_size, load_policy
     from rsjax.tools.policies.run_data import RunData, named, replicates, sized_policy, training_of
@@ -77,7 +77,7 @@ def main() -> None:
     for run in runs.values():  # checked before hours of training
         run.check_world(first, judge)
     first.world_judge(judge)
-    rule = frames_in_a_row(first.run)
+    rule = head_rule(first.run)
     config = first.simulator
     imagined = options.imagined or 4 * trials.episodes
     check_imagined(imagined, trials)
@@ -90,9 +90,7 @@ def main() -> None:
         size = sized_policy(options.size, options.steps)
         policies, training = trained_policies(size, demos, out, options.checkpoints, options.trainings)
     common_size(policies.values())
-    worlds = {
-        name: partial(run.world, trials.together, judge, measured=True, in_a_row=rule) for name, run in runs.items()
-    }
+    worlds = {name: partial(run.world, trials.together, judge, measured=True, rule=rule) for name, run in runs.items()}
     with open_lift(config, trials) as simulator:
         compare(
             policies,

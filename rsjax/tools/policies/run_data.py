@@ -78,7 +78,7 @@ class RunData:
         return from_dict(SimConfig, self.clips.manifest["config"])
 
     def world(
-        self, count: int, judge: Path | None = None, measured: bool = False, in_a_row: int | None = None
+        self, count: int, judge: Path | None = None, measured: bool = False, rule: HeadJudge | None = None
     ) -> ModelWorld:
         """Returns the run's world model as a world of ``count`` episodes, with a judge as of :meth:`world_judge`.
 
@@ -92,22 +92,22 @@ class RunData:
         coverage = None
         if measured:
             coverage = make_coverage(self.trained, self.clips, self.run)
-        return ModelWorld(self.trained, count, self.world_judge(judge, in_a_row), coverage=coverage)
+        return ModelWorld(self.trained, count, self.world_judge(judge, rule), coverage=coverage)
 
-    def world_judge(self, folder: Path | None = None, in_a_row: int | None = None) -> Judge | HeadJudge:
+    def world_judge(self, folder: Path | None = None, rule: HeadJudge | None = None) -> Judge | HeadJudge:
         """Returns the run's judge, that in another folder, or for the path "head" that of the model's own heads.
 
         Args:
-            in_a_row: how many frames in a row must show success to the heads; None: as they were validated.
+            rule: by which the heads decide, one for all models that are compared; None: as they were validated.
 
         Raises:
             UserError: there is no judge, its frames differ in size from the run's, or the model has no state heads.
         """
         if folder == Path(HEAD):
             judge = head_judge(self.trained, self.run)
-            if in_a_row in (None, judge.in_a_row):
+            if rule is None or rule.key == judge.key:
                 return judge
-            return HeadJudge(in_a_row)
+            return rule
         return self.judge(folder)
 
     def check_world(self, like: "RunData", judge: Path | None = None) -> None:

@@ -3,7 +3,7 @@
 Axes: B videos, T frames, n frames in a row.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -102,19 +102,19 @@ def head_judge(trained: TrainedModel, run: Path | None = None) -> HeadJudge:
     check_heads(trained.config.model, "the model" if run is None else str(run))
     if run is None or not (run / FOLDER / VALIDATION).exists():
         return HeadJudge()
-    validation = _validation(run)
-    return HeadJudge(frames_in_a_row(run), validation, float(validation.get("shift", 0.0)))
+    return replace(head_rule(run), validation=_validation(run))
 
 
-def frames_in_a_row(run: Path) -> int:
-    """Returns in how many frames in a row a run's head must read success: as many as ``rsjax judge RUN --head`` chose.
+def head_rule(run: Path) -> HeadJudge:
+    """Returns the rule by which a run's head decides, without a validation: as ``rsjax judge RUN --head`` chose it.
 
     Raises:
         UserError: the file of the validation is damaged.
     """
     if not (run / FOLDER / VALIDATION).exists():
-        return HeadJudge().in_a_row
-    return int(_validation(run).get("in_a_row", 1))
+        return HeadJudge()
+    validation = _validation(run)
+    return HeadJudge(int(validation.get("in_a_row", 1)), shift=float(validation.get("shift", 0.0)))
 
 
 def _validation(run: Path) -> dict[str, Any]:

@@ -28,7 +28,7 @@ from rsjax.tools.pipeline.evaluations import EvaluationRequest, evaluate_run
 from rsjax.tools.pipeline.prepared import prepare_store
 from rsjax.tools.pipeline.run import Run
 from rsjax.tools.pipeline.stages import run_all
-from rsjax.tools.policies.judges.head_judge import frames_in_a_row
+from rsjax.tools.policies.judges.head_judge import head_rule
 from rsjax.tools.policies.judges.judge_training import FOLDER as JUDGE
 from rsjax.tools.policies.judges.trained_judge import VALIDATION
 from rsjax.tools.policies.on_policy import cut, rollouts
@@ -296,8 +296,8 @@ def measure(
         trials = behaviour.trials
         judge = behaviour.judge or data.run / JUDGE
         made = {name: RunData(run, data.data_dir) for name, run in runs.items()}
-        rule = frames_in_a_row(data.run)  # no run of a round has one
-        worlds = {name: partial(one.world, trials.together, judge, in_a_row=rule) for name, one in made.items()}
+        rule = head_rule(data.run)  # no run of a round has one
+        worlds = {name: partial(one.world, trials.together, judge, rule=rule) for name, one in made.items()}
         compare(behaviour.policies, behaviour.simulator, worlds, trials, out / "policy_evaluation")
         about["success"] = read_json(out / "policy_evaluation" / "results.json")["runs"]
     write_json(out / "results.json", about)

@@ -14,7 +14,7 @@ from rsjax.config import StateHeadsConfig
 from rsjax.errors import UserError
 from rsjax.files import write_json
 from rsjax.models.base import TeacherForced
-from rsjax.tools.policies.judges.head_judge import HeadJudge, frames_in_a_row, head_judge, matching_shift
+from rsjax.tools.policies.judges.head_judge import HeadJudge, head_judge, head_rule, matching_shift
 from rsjax.tools.policies.judges.judge import FAIL, SUCCESS, all_successes
 from rsjax.tools.policies.judges.judge_training import head_validation
 from rsjax.tools.policies.judges.trained_judge import Footage
@@ -165,10 +165,14 @@ def test_heads_are_validated_on_true_frames_and_on_rollouts(tmp_path: Path) -> N
     assert result["generated"]["whole_clips"]["1"]["right"][0] == 1
     write_json(tmp_path / "judge_head" / "validation.json", result | {"shift": -0.5})
     assert head_judge(trained, tmp_path).shift == -0.5
+    assert head_rule(tmp_path) == HeadJudge(2, shift=-0.5)
     write_json(tmp_path / "judge_head" / "validation.json", result)
     assert head_judge(trained, tmp_path) == HeadJudge(2, json.loads(json.dumps(result)))
-    assert (frames_in_a_row(tmp_path), frames_in_a_row(tmp_path / "elsewhere")) == (2, 1)
+    assert (head_rule(tmp_path), head_rule(tmp_path / "elsewhere")) == (HeadJudge(2), HeadJudge())
     data = RunData(tmp_path)
     data.__dict__["trained"] = trained
-    assert data.world_judge(Path("head")) == data.world_judge(Path("head"), 2) == head_judge(trained, tmp_path)
-    assert data.world_judge(Path("head"), 1) == HeadJudge(1)  # as another run's, with which it is compared
+    assert (
+        data.world_judge(Path("head")) == data.world_judge(Path("head"), HeadJudge(2)) == head_judge(trained, tmp_path)
+    )
+    for rule in (HeadJudge(1), HeadJudge(2, shift=-0.5)):  # another run's, with which it is compared
+        assert data.world_judge(Path("head"), rule) == rule
