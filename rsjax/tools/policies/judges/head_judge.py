@@ -53,13 +53,13 @@ class HeadJudge:
         """Returns the probability of each of ``LABELS`` at the end of each video.
 
         Args:
-            state: as of :class:`rsjax.clip.Video`, of at least ``in_a_row`` frames. Frames before a prompt's last have
-                no reading (NaN) and show no success.
+            state: as of :class:`rsjax.clip.Video`; of fewer frames than ``in_a_row``, all must show success. Frames
+                before a prompt's last have no reading (NaN) and show no success.
         """
         success = np.nan_to_num(state[:, -self.in_a_row :, STATE.index("success")])
         if self.shift:
             success = expit(logit(success) + self.shift)
-        verdicts = np.zeros((self.in_a_row, len(success), len(LABELS)))
+        verdicts = np.zeros((*success.T.shape, len(LABELS)))
         verdicts[..., SUCCESS] = success.T
         verdicts[..., FAIL] = 1 - success.T
         return all_successes(verdicts)

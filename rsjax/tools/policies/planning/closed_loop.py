@@ -23,9 +23,10 @@ from rsjax.files import content_hash, write_file, write_json
 from rsjax.model_directory import locate, output_directory
 from rsjax.models.trained import TrainedModel
 from rsjax.progress import Progress
+from rsjax.tools.policies.judges.head_judge import HeadJudge, head_rule
 from rsjax.tools.policies.judges.judge import frames_of, judge_key
 from rsjax.tools.policies.judges.judge_training import FOLDER
-from rsjax.tools.policies.judges.trained_judge import load_judge
+from rsjax.tools.policies.judges.trained_judge import TrainedJudge, load_judge
 from rsjax.tools.policies.judges.validation import markdown, summary
 from rsjax.tools.policies.planning.energies import (
     RecentFrames,
@@ -63,8 +64,8 @@ class PlanSettings:
         planner: how the planner searches; its ``method`` is replaced by each of ``methods``.
         methods: planning methods to compare.
         energy: "judge": 1 - the probability of success according to the run's judge; "success": according to the
-            model's own success head; otherwise the distance of the last frame to the goal image, in the model's tokens,
-            in pixels, or in LPIPS.
+            model's own success head, by the rule that ``rsjax judge RUN --head`` chose; otherwise the distance of the
+            last frame to the goal image, in the model's tokens, in pixels, or in LPIPS.
         lpips_weights: a file of weights for "lpips".
         episodes: number of episodes, with seeds from ``FIRST_SEED`` on.
         max_steps: steps of an episode, at most.
@@ -131,7 +132,7 @@ def energy_of(trained: TrainedModel, run: Path, settings: PlanSettings, goal: UI
             missing or damaged.
     """
     if settings.energy == "success":
-        return success(trained)
+        return success(trained, head_rule(run))
     if settings.energy == "judge":
         judge = load_judge(run / FOLDER, len(goal))
         return imagined(trained, judged(judge), frames_of(judge))
@@ -240,12 +241,14 @@ def compare(
     ways = actors(trained, run, settings, policies)
     side = config.sim.image_size
     energy_of(trained, run, settings, np.zeros((side, side, 3), np.uint8))  # raises before hours of episodes
-    judge = None
+    judge: TrainedJudge | HeadJudge | None = None
     validation = None
     lpips = ""
     if settings.energy == "judge":
         judge = load_judge(run / FOLDER)
         validation = judge.validation
+    elif settings.energy == "success":
+        judge = head_rule(run)
     elif settings.energy == "lpips":
         lpips = content_hash(Path(settings.lpips_weights))
     used = model_key(trained), judge_key(judge), *(policy.key for policy in policies.values())

@@ -12,12 +12,11 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
 from rsjax.clip import Video
-from rsjax.data.state_labels import STATE
 from rsjax.errors import UserError
 from rsjax.evaluation.metrics.lpips import distances
 from rsjax.models.trained import TrainedModel
 from rsjax.tokenizers.lpips import load_lpips, min_size
-from rsjax.tools.policies.judges.head_judge import head_judge
+from rsjax.tools.policies.judges.head_judge import HeadJudge, check_heads
 from rsjax.tools.policies.judges.judge import HISTORY, SUCCESS, Judge
 from rsjax.tools.policies.planning.planner import Energy
 
@@ -54,22 +53,28 @@ def imagined(model: TrainedModel, score: Score, frames: int = HISTORY) -> Energy
     return lambda recent, candidates: score(planned(model, recent, candidates, frames).rgb)
 
 
-def success(model: TrainedModel) -> Energy:
-    """Returns an energy: 1 - the mean over the horizon of the probability of success that the model's own head reads.
+def success(model: TrainedModel, rule: HeadJudge | None = None) -> Energy:
+    """Returns an energy: 1 - the mean over the horizon of the probability of success by the model's own head.
 
     The mean, since a planner that looks at the end alone may put success off for ever. The energy takes a
     :class:`RecentFrames`, and decodes no picture but the last.
 
+    Args:
+        rule: how the head decides; by default in single frames.
+
     Raises:
         UserError: the model has no state heads.
     """
-    head_judge(model)
+    check_heads(model.config.model, "the model")
+    head = rule or HeadJudge()
 
     def energy(recent: RecentFrames, candidates: Float[np.ndarray, "N H A"]) -> Float[np.ndarray, " N"]:
         state = planned(model, recent, candidates, 1).state
         assert state is not None
-        horizon = candidates.shape[1]  # before it are the prompt's frames
-        return 1 - state[:, -horizon:, STATE.index("success")].mean(axis=1, dtype=np.float64)
+        frames = state.shape[1]
+        before = frames - candidates.shape[1]  # the prompt's
+        read = np.stack([head.read(state[:, : t + 1])[:, SUCCESS] for t in range(before, frames)])
+        return 1 - read.mean(axis=0)
 
     return energy
 

@@ -49,6 +49,7 @@ def test_a_head_judges_by_the_last_frames_that_it_read() -> None:
     assert HeadJudge(3).read(state_of(P))[0].tolist() == pytest.approx([0.2, 0.8, 0])
     unknown = state_of(np.array([np.nan, 0.9]))
     assert HeadJudge(2).read(unknown)[0].argmax() == FAIL
+    assert HeadJudge(3).read(state_of(P[2:]))[0].tolist() == pytest.approx([0.7, 0.3, 0])  # no more frames yet
     assert HeadJudge(1).key != HeadJudge(2).key
     with pytest.raises(UserError) as caught:
         head_judge(SimpleNamespace(config=toy.config()), Path("runs/a"))  # type: ignore[arg-type]

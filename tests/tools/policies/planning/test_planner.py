@@ -11,13 +11,14 @@ from rsjax.config import ConfigError, RoboScapeConfig, StateHeadsConfig
 from rsjax.data.normalization import Normalization
 from rsjax.data.store import Store
 from rsjax.errors import UserError
+from rsjax.files import write_json
 from rsjax.models.base import Assets, create_model
 from rsjax.models.trained import TrainedModel
 from rsjax.tools.policies.config import PolicyConfig
 from rsjax.tools.policies.judges.judge import HISTORY
 from rsjax.tools.policies.planning import closed_loop as planning
 from rsjax.tools.policies.planning import energies
-from rsjax.tools.policies.planning.closed_loop import PlanSettings, compare, folder, results_text
+from rsjax.tools.policies.planning.closed_loop import PlanSettings, compare, energy_of, folder, results_text
 from rsjax.tools.policies.planning.energies import RecentFrames, imagined, judged, pixel_distance, token_distance
 from rsjax.tools.policies.planning.planner import Planner, PlannerConfig, search
 from rsjax.tools.policies.planning.proposals import policy_rollouts
@@ -174,17 +175,27 @@ def test_energies_are_scores_of_what_a_model_generates() -> None:
     np.testing.assert_array_equal(given[0], videos)
 
 
-def test_success_is_read_from_the_models_own_head(model: TrainedModel, summing: TrainedModel) -> None:
+def test_success_is_read_from_the_models_own_head_by_the_runs_rule(
+    model: TrainedModel, summing: TrainedModel, tmp_path: Path
+) -> None:
     with pytest.raises(UserError) as refused:
         energies.success(model)
     assert "has no state heads" in str(refused.value)
     rgb = toy.clip(0).rgb[:SEEN]
     actions = candidates_of(np.random.default_rng(0))
-    found = energies.success(summing)(RecentFrames(rgb, None, actions[0, :SEEN]), actions[:, SEEN:])
+    asked = RecentFrames(rgb, None, actions[0, :SEEN]), actions[:, SEEN:]
+    found = energies.success(summing)(*asked)
     state = summing.plan(rgb, actions).state
     assert state is not None
-    np.testing.assert_allclose(found, 1 - state[:, SEEN:, 0].mean(1), rtol=1e-5)  # after the prompt
+    p = state[:, :, 0].astype(np.float64)
+    np.testing.assert_allclose(found, 1 - p[:, SEEN:].mean(1), rtol=1e-5)  # after the prompt
     assert abs(found[0] - found[1]) > 0
+    write_json(tmp_path / "judge_head" / "validation.json", {"in_a_row": 2, "shift": -1.5})
+    shifted = 1 / (1 + (1 - p) / p * np.exp(1.5))
+    least = np.minimum(shifted[:, 1:], shifted[:, :-1])  # the prompt's last frame counts for the first of the horizon
+    least[:, SEEN - 1] = np.where(np.isnan(p[:, SEEN - 1]), 0, least[:, SEEN - 1])
+    ruled = energy_of(summing, tmp_path, PlanSettings(energy="success"), rgb[0])(*asked)
+    np.testing.assert_allclose(ruled, 1 - least[:, SEEN - 1 :].mean(1), rtol=1e-5)
 
 
 def test_every_search_begins_with_a_policys_way_and_leaves_it_for_a_clearly_better_one() -> None:
