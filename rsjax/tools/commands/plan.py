@@ -30,6 +30,10 @@ class Options:
     """A policy of rsjax policy_learning to compare with as well."""
     warm_start: bool = False
     """Also plan with the policy's own rollouts in the world model among the candidates."""
+    from_clips: bool = False
+    """Also plan with what followed the most similar frames of successful training clips among the candidates."""
+    data_dir: Path = Path("data")
+    """Directory of the simulated data sets, for from-clips."""
     episodes: int = 50
     """Episodes for each way to act, with equal starts."""
     max_steps: int = 30
@@ -58,6 +62,7 @@ def main() -> None:
     from rsjax.tools.policies.planning.closed_loop import PlanSettings, compare, folder, results_text
     from rsjax.tools.policies.planning.planner import PlannerConfig
     from rsjax.tools.policies.policy import load_policy
+    from rsjax.tools.policies.run_data import RunData
     from rsjax.tools.policies.worlds.simulator_world import SimulatorWorld
 
     fields = ("horizon", "candidates", "rounds", "elites", "temperature", "seed")
@@ -70,7 +75,10 @@ def main() -> None:
     policies: dict[str, Any] = {}
     if options.policy:
         policies[f"policy {options.policy}"] = load_policy(options.policy)
+    clips = None
+    if options.from_clips:
+        clips = RunData(options.run, options.data_dir).clips
     with closing(SimulatorWorld.lift(trained.config.sim, 1)) as simulator:
-        result = compare(trained, options.run, simulator, settings, policies)
+        result = compare(trained, options.run, simulator, settings, policies, clips)
     print(results_text(result))
     print(folder(options.run, result["key"]) / "result.json")

@@ -17,6 +17,7 @@ from jaxtyping import Float32, UInt8
 from rsjax.artifact import make_once
 from rsjax.config import content_key
 from rsjax.config.fields import require, require_range
+from rsjax.data.store import Store
 from rsjax.errors import UserError
 from rsjax.evaluation.statistics import wilson
 from rsjax.files import content_hash, write_file, write_json
@@ -37,8 +38,8 @@ from rsjax.tools.policies.planning.energies import (
     success,
     token_distance,
 )
-from rsjax.tools.policies.planning.planner import Energy, Planner, PlannerConfig
-from rsjax.tools.policies.planning.proposals import policy_rollouts
+from rsjax.tools.policies.planning.planner import Energy, Planner, PlannerConfig, Propose
+from rsjax.tools.policies.planning.proposals import SimilarClips, policy_rollouts, similar_clips
 from rsjax.tools.policies.policy import Policy
 from rsjax.tools.policies.studies.trials import FPS
 from rsjax.tools.policies.worlds.actions import check_takes_actions
@@ -50,6 +51,8 @@ from rsjax.tools.studies.tables import ABSENT, Table, as_markdown
 
 EnergyName: TypeAlias = Literal["judge", "success", "tokens", "pixels", "lpips"]
 MakeActor: TypeAlias = Callable[[int, UInt8[np.ndarray, "S S 3"]], Actor]  # from an episode's seed and goal image
+MakePropose: TypeAlias = Callable[[int], Propose]  # from an episode's seed
+SIMILAR = "similar clips"
 MEMORY = 2  # frames in the world model's prompt; one at an episode's beginning
 HEADINGS = ("way to act", "success", "95 % interval", "steps", "seconds a decision", "numbers clipped")
 VIDEOS = 3  # videos of each way to act
@@ -144,11 +147,16 @@ def energy_of(trained: TrainedModel, run: Path, settings: PlanSettings, goal: UI
 
 
 def actors(
-    trained: TrainedModel, run: Path, settings: PlanSettings, policies: Mapping[str, Policy] | None = None
+    trained: TrainedModel,
+    run: Path,
+    settings: PlanSettings,
+    policies: Mapping[str, Policy] | None = None,
+    clips: SimilarClips | None = None,
 ) -> dict[str, MakeActor]:
-    """Returns the ways to act by name: random, expert, the policies, and the planner with each method.
+    """Returns the ways to act by name: random, expert, similar clips, the policies, and the planner with each method.
 
-    With ``settings.warm_start`` there is also the planner with each method and policy, named "METHOD from POLICY".
+    With ``settings.warm_start`` there is also the planner with each method and policy, named "METHOD from POLICY", and
+    with clips "METHOD from similar clips".
 
     Raises:
         UserError: a policy's actions or frames differ in size from those of the run's clips.
@@ -159,24 +167,29 @@ def actors(
     high = np.ones(config.clips.action_dim)
     scale = np.asarray(trained.assets.normalization.action_std)
     controls = config.sim.control_steps
+    half = settings.planner.candidates // 2
+    horizon = settings.planner.horizon
 
     def random(seed: int, goal: np.ndarray) -> Actor:
         rng = np.random.default_rng(seed)
         return lambda observation: np.tile(rng.uniform(-1, 1, len(high) // controls), controls)[None]
 
-    def planning(method: str, policy: Policy | None = None) -> MakeActor:
+    def planning(method: str, proposing: MakePropose | None = None) -> MakeActor:
         search = PlannerConfig(**asdict(settings.planner) | {"method": method, "hold": controls})
 
         def make(seed: int, goal: np.ndarray) -> Actor:
             propose = None
             own = search
-            if policy is not None:
+            if proposing is not None:
                 own = replace(search, margin=MARGIN)
-                propose = partial(policy_rollouts, trained, policy, search.candidates // 2, search.horizon, seed)
+                propose = proposing(seed)
             planner = Planner(energy_of(trained, run, settings, goal), -high, high, own, propose, scale)
             return PlanningActor(planner, len(high), depth)
 
         return make
+
+    def rolling(policy: Policy) -> MakePropose:
+        return lambda seed: partial(policy_rollouts, trained, policy, half, horizon, seed)
 
     def expert(seed: int, goal: np.ndarray) -> Actor:
         scripted = skilled_expert(seed)
@@ -184,10 +197,15 @@ def actors(
 
     ways: dict[str, MakeActor] = {"random": random, "expert": expert}
     ways |= {name: policy_actor(name, policy, trained) for name, policy in policies.items()}
+    proposals: dict[str, MakePropose] = {}
+    if settings.warm_start:
+        proposals |= {name: rolling(policy) for name, policy in policies.items()}
+    if clips is not None:
+        ways[SIMILAR] = lambda seed, goal: lambda observation: clips.ways(observation["rgb"][0], 1, 1)[:, 0]
+        proposals[SIMILAR] = lambda seed: lambda recent: clips.ways(recent.rgb[-1], half, horizon)
     for method in settings.methods:
         ways[method] = planning(method)
-        if settings.warm_start:
-            ways |= {f"{method} from {name}": planning(method, policy) for name, policy in policies.items()}
+        ways |= {f"{method} from {name}": planning(method, proposing) for name, proposing in proposals.items()}
     return ways
 
 
@@ -216,6 +234,7 @@ def compare(
     simulator: World,
     settings: PlanSettings,
     policies: Mapping[str, Policy] | None = None,
+    clips: Store | None = None,
 ) -> dict[str, Any]:
     """Runs episodes in the simulator with each way to act, and returns success rates and times.
 
@@ -225,6 +244,7 @@ def compare(
         trained: the model of ``run``, which was trained on simulated clips.
         simulator: the world of these clips, for one episode at a time.
         policies: further ways to act, by name.
+        clips: the run's clips, for ways that follow the most similar ones.
 
     Raises:
         UserError: the run is of recordings, its model takes no actions, or something that the energy needs is missing.
@@ -238,7 +258,10 @@ def compare(
         bool(policies) or not settings.warm_start,
         "plan.warm_start is on, but there is no policy to start from; name one with --policy",
     )
-    ways = actors(trained, run, settings, policies)
+    similar = None
+    if clips is not None:
+        similar = similar_clips(clips)
+    ways = actors(trained, run, settings, policies, similar)
     side = config.sim.image_size
     energy_of(trained, run, settings, np.zeros((side, side, 3), np.uint8))  # raises before hours of episodes
     judge: TrainedJudge | HeadJudge | None = None

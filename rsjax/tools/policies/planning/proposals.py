@@ -1,16 +1,24 @@
-"""Candidates that a policy proposes to a planner: what it does itself, in the world model.
+"""Candidates for a planner: what a policy does in the world model, and what followed similar frames of training clips.
 
-Axes: N candidates, H steps of the horizon, P frames so far, A action dimensions.
+Axes: N candidates, H steps of the horizon, C clips, T frames, S×S pixels, K numbers of a small picture, A action
+dimensions.
 """
 
 import zlib
+from dataclasses import dataclass
 
+import cv2
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Bool, Float32, UInt8
 
+from rsjax.data.clips import readable
+from rsjax.data.store import Store
+from rsjax.errors import UserError
 from rsjax.models.trained import TrainedModel
 from rsjax.tools.policies.planning.energies import RecentFrames, planned
 from rsjax.tools.policies.policy import Policy
+
+SIDE = 16  # pixels of the pictures in which frames are compared
 
 
 def policy_rollouts(
@@ -34,3 +42,56 @@ def policy_rollouts(
             return actions[:, :horizon]
         observed = policy.model.config.observations
         frames = np.concatenate([prompt, planned(model, recent, actions, observed).rgb], axis=1)
+
+
+@dataclass(frozen=True)
+class SimilarClips:
+    """Training clips that succeed, to follow from the frame that is most like the present one.
+
+    As in visual imitation by nearest neighbours (Pari et al. 2021), but in plain pixels.
+
+    Attributes:
+        pictures: their frames, small, in [0, 1].
+        actions: row t led to frame t.
+        before: the frames before their first success.
+    """
+
+    pictures: Float32[np.ndarray, "C T K"]
+    actions: Float32[np.ndarray, "C T A"]
+    before: Bool[np.ndarray, "C T"]
+
+    def ways(self, frame: UInt8[np.ndarray, "S S 3"], count: int, horizon: int) -> Float32[np.ndarray, "N H A"]:
+        """Returns what was done after the most similar frame of each of the ``count`` most similar clips, best first.
+
+        There are fewer ways if there are fewer clips. Beyond its clip's end, a way goes on with the last action.
+        """
+        squares = np.square(self.pictures).sum(axis=-1)
+        distances = np.where(self.before, squares - 2 * self.pictures @ _small(frame), np.inf)
+        nearest = distances.argmin(axis=1)
+        clips = distances.min(axis=1).argsort(kind="stable")[:count]
+        rows = np.minimum(nearest[clips, None] + np.arange(1, horizon + 1), self.actions.shape[1] - 1)
+        return self.actions[clips[:, None], rows]
+
+
+def similar_clips(clips: Store) -> SimilarClips:
+    """Reads the training clips that succeed after their first frame.
+
+    Raises:
+        UserError: there is none.
+    """
+    pictures = []
+    actions = []
+    before = []
+    for _, clip in readable(clips.source("train")):
+        success = np.logical_or.accumulate(clip["success"])
+        if success[-1] and not success[0]:
+            pictures.append(np.stack([_small(frame) for frame in clip["rgb"]]))
+            actions.append(clip["actions"])
+            before.append(~success)
+    if not pictures:
+        raise UserError(f"{clips.path}: none of its training clips succeeds, so a planner has none to begin with")
+    return SimilarClips(np.stack(pictures), np.stack(actions), np.stack(before))
+
+
+def _small(frame: UInt8[np.ndarray, "S S 3"]) -> Float32[np.ndarray, " K"]:
+    return cv2.resize(frame, (SIDE, SIDE), interpolation=cv2.INTER_AREA).astype(np.float32).ravel() / 255

@@ -21,7 +21,7 @@ from rsjax.tools.policies.planning import energies
 from rsjax.tools.policies.planning.closed_loop import PlanSettings, compare, energy_of, folder, results_text
 from rsjax.tools.policies.planning.energies import RecentFrames, imagined, judged, pixel_distance, token_distance
 from rsjax.tools.policies.planning.planner import Planner, PlannerConfig, search
-from rsjax.tools.policies.planning.proposals import policy_rollouts
+from rsjax.tools.policies.planning.proposals import policy_rollouts, similar_clips
 from rsjax.tools.policies.worlds.model_world import FirstFrame, ModelWorld
 from rsjax.tools.policies.worlds.simulator_world import SimulatorWorld
 from rsjax.tools.policies.worlds.world import run_episodes
@@ -254,6 +254,31 @@ def test_a_policys_rollouts_are_its_episodes_in_the_world_model(model: TrainedMo
     assert np.ptp(rolled[0], axis=0).min() > 1e-3
 
 
+def lifts(*firsts: int) -> Any:
+    """A store of clips that succeed in these frames alone."""
+    clips = [toy.clip(number) for number in range(len(firsts))]
+    frames = np.arange(len(clips[0].rgb))
+    records = [vars(clip) | {"success": frames == first} for clip, first in zip(clips, firsts, strict=True)]
+    return SimpleNamespace(path=Path("clips"), source=lambda split: records)
+
+
+def test_similar_clips_are_followed_from_their_most_similar_frame_before_success() -> None:
+    similar = similar_clips(lifts(3, 2, 99, 0))  # the third never succeeds, the last from the beginning
+    one, other = toy.clip(0), toy.clip(1)
+    ways = similar.ways(one.rgb[1], 9, 2)
+    assert ways.shape == (2, 2, 28)
+    np.testing.assert_array_equal(ways[0], one.actions[2:4])
+    np.testing.assert_array_equal(similar.ways(other.rgb[0], 1, 3), other.actions[None, 1:4])
+    np.testing.assert_array_equal(similar.ways(one.rgb[4], 1, 2)[0], one.actions[3:5])  # it has succeeded in frame 3
+    beyond = similar.ways(one.rgb[2], 1, 99)[0]
+    rest = len(one.rgb) - 3
+    np.testing.assert_array_equal(beyond[:rest], one.actions[3:])
+    assert (beyond[rest:] == one.actions[-1]).all()
+    with pytest.raises(UserError) as refused:
+        similar_clips(lifts(99, 0))
+    assert "clips: none of its training clips succeeds" in str(refused.value)
+
+
 def test_the_distance_of_tokens_counts_bits(model: TrainedModel) -> None:
     frames = np.stack([toy.clip(number).rgb[:1] for number in range(2)])
     found = token_distance(model, frames[1, 0])(frames)
@@ -324,6 +349,12 @@ def test_a_comparison_resumes_and_counts(model: TrainedModel, tmp_path: Path, mo
     warmed = compare(model, tmp_path, lift(), warm, {"policy a/b": policy})["ways"]
     assert list(warmed) == ["random", "expert", "policy a/b", "cem", "cem from policy a/b"]
     assert warmed["cem from policy a/b"]["steps"] == 1  # the policy's plans press at once
+    clips = lifts(3, 2)
+    for record in clips.source("train"):
+        record["actions"] = np.ones_like(record["actions"])
+    followed = compare(model, tmp_path, lift(), replace(one, methods=("cem",)), clips=clips)["ways"]
+    assert list(followed) == ["random", "expert", "similar clips", "cem", "cem from similar clips"]
+    assert followed["similar clips"]["steps"] == followed["cem from similar clips"]["steps"] == 1  # they press at once
     with pytest.raises(ConfigError) as caught:
         compare(model, tmp_path, lift(), warm)
     assert "no policy to start from" in str(caught.value)
