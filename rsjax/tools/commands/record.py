@@ -24,6 +24,8 @@ class Options:
     """Directories of trained policies, such as RUN/policy_evaluation/policy/at-90; they take turns."""
     episodes: int = 25
     """Episodes of each policy."""
+    max_steps: int = 0
+    """Steps of an episode; 0: as many as the run's clips have."""
     together: int = 5
     """Episodes that run at a time."""
     data_dir: Path = Path("data")
@@ -37,7 +39,7 @@ def main() -> None:
     """Writes a store of the episodes and prints the recipe that takes it."""
     tune_process()
     options = parse_options(sys.argv[1:], "rsjax record", Options.__doc__ or "", Options())
-    if not options.policies or options.episodes < 1 or options.together < 1:
+    if not options.policies or min(options.episodes, options.together) < 1 or options.max_steps < 0:
         raise ConfigError("name a policy at least, and --episodes and --together of 1 or more: --policies DIR")
     from rsjax.config import content_key
     from rsjax.processes import count_cores
@@ -53,9 +55,11 @@ def main() -> None:
     numbers = {"train": range(FIRST, FIRST + total)}
     keys = str([policy.key for policy in policies.values()])
     together = min(options.together, options.episodes)  # what a policy draws depends on it
-    folder = (options.out or options.run / "recorded") / content_key("recorded", 2, config, keys, total, together)
+    steps = options.max_steps or config.frames - 1
+    of = content_key("recorded", 3, config, keys, total, together, steps)
+    folder = (options.out or options.run / "recorded") / of
     with closing(SimulatorWorld.lift(config, together, count_cores())) as world:
-        store = rollouts(policies, world, config, numbers, config.frames - 1, folder, "record")
+        store = rollouts(policies, world, config, numbers, steps, folder, "record")
     share = store.manifest["success_share"]
     print(f"{total} episodes, {100 * share:.0f} % end in success")
     print(f"--sim.recipe expert recorded:{store.path}")

@@ -65,18 +65,26 @@ class HeadJudge:
         return all_successes(verdicts)
 
 
-def matching_shift(state: Float[np.ndarray, "B T 3"], success: Bool[np.ndarray, "B T"], in_a_row: int) -> float:
-    """Returns the shift of the logit of success with which the head calls as many videos a success as truly are one.
+def likeliest(state: Float[np.ndarray, "B T 3"], in_a_row: int) -> Float[np.ndarray, " B"]:
+    """Returns each video's largest probability of success, the least of ``in_a_row`` frames each time.
 
     Args:
         state: as of :class:`rsjax.clip.Video`, of generated frames.
-        success: what the simulator says of the same frames.
     """
-    single = [HeadJudge().read(state[:, : t + 1]) for t in range(state.shape[1])]
-    rows = [all_successes(np.stack(single[max(0, t + 1 - in_a_row) : t + 1]))[:, SUCCESS] for t in range(len(single))]
-    likely = np.sort(logit(np.clip(np.max(rows, axis=0), 1e-6, 1 - 1e-6)))[::-1]  # of each video, the likeliest first
-    true = int(success.any(axis=1).sum())
-    edges = np.concatenate([[likely[0] + 1], likely, [likely[-1] - 1]])
+    judge = HeadJudge(in_a_row)
+    return np.max([judge.read(state[:, : t + 1])[:, SUCCESS] for t in range(state.shape[1])], axis=0)
+
+
+def matching_shift(likely: Float[np.ndarray, " B"], success: Bool[np.ndarray, " B"]) -> float:
+    """Returns the shift of the logit of success with which the head calls as many videos a success as truly are one.
+
+    Args:
+        likely: the :func:`likeliest` probabilities of generated videos.
+        success: what the simulator says of the same videos.
+    """
+    logits = np.sort(logit(np.clip(likely, 1e-6, 1 - 1e-6)))[::-1]
+    true = int(success.sum())
+    edges = np.concatenate([[logits[0] + 1], logits, [logits[-1] - 1]])
     return -float(edges[true : true + 2].mean())
 
 

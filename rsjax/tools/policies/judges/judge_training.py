@@ -21,7 +21,7 @@ from rsjax.progress import Progress, note
 from rsjax.tools.pipeline.run import Run
 from rsjax.tools.pipeline.run_clips import relocated
 from rsjax.tools.policies.judges.head_judge import FOLDER as HEAD_FOLDER
-from rsjax.tools.policies.judges.head_judge import HeadJudge, head_judge, matching_shift
+from rsjax.tools.policies.judges.head_judge import HeadJudge, head_judge, likeliest, matching_shift
 from rsjax.tools.policies.judges.judge import FAIL, LABELS, SUCCESS, Judge
 from rsjax.tools.policies.judges.trained_judge import VALIDATION, Footage, load_judge, train_judge
 from rsjax.tools.policies.judges.validation import outcomes, scores, validate
@@ -134,8 +134,8 @@ def validate_heads(
     """Validates a model's own success head as a judge, and writes the result to ``RUN/judge_head/validation.json``.
 
     Args:
-        also: stores of clips, of which the model generates ``settings.clips`` each; the head's logit is shifted so that
-            it calls as many of them a success as the simulator does.
+        also: stores of clips or whole episodes, of which the model generates ``settings.clips`` each; the head's logit
+            is shifted so that it calls as many of them a success as the simulator does.
 
     Raises:
         UserError: the run or its clips are missing, the model has no state heads, or the clips of a store in ``also``
@@ -149,12 +149,18 @@ def validate_heads(
     shift = 0.0
     if also:
         first = trained.config.prompt_frames
-        records = [record for path in also for record in _labelled(open_store(path), own, settings.clips)]
-        batch = Clips.stacked(records, range(len(records)))
-        made = imagined(trained, batch).frames(first)
-        assert made.state is not None
-        shift = matching_shift(made.state, batch.success[:, first:], settings.in_a_row)
-        note(f"the head's logit of success is shifted by {shift:+.2f}, to match the rate of {len(records)} clips")
+        likely = []
+        success = []
+        for path in also:
+            records = _labelled(open_store(path), own, settings.clips, longer=True)
+            batch = Clips.stacked(records, range(len(records)))
+            made = imagined(trained, batch).frames(first)
+            assert made.state is not None
+            likely.append(likeliest(made.state, settings.in_a_row))
+            success.append(batch.success[:, first:].any(axis=1))
+        true = np.concatenate(success)
+        shift = matching_shift(np.concatenate(likely), true)
+        note(f"the head's logit of success is shifted by {shift:+.2f}, to match {true.sum()} of {len(true)} clips")
     judge = HeadJudge(settings.in_a_row, shift=shift)
     result = head_validation(trained, judge, test_clips) | {"settings": vars(settings), "shift": shift}
     write_json(run / HEAD_FOLDER / VALIDATION, result)
@@ -211,8 +217,12 @@ def _held_out(clips: Store, settings: JudgeSettings) -> list[Record]:
     return records
 
 
-def _labelled(clips: Store, own: Store, count: int) -> list[Record]:
-    """Returns at most ``count`` training clips of a store, which must be labelled and like the run's ``own``."""
+def _labelled(clips: Store, own: Store, count: int, longer: bool = False) -> list[Record]:
+    """Returns at most ``count`` training clips of a store, which must be labelled and like the run's ``own``.
+
+    Args:
+        longer: whether they may have more frames.
+    """
     if clips is not own and not knows_success(clips):
         raise UserError(f"{clips.path}: its clips do not say whether they succeed; a judge learns from such labels")
     source = clips.source("train")
@@ -220,7 +230,10 @@ def _labelled(clips: Store, own: Store, count: int) -> list[Record]:
     if len(records) < 2:
         raise UserError(f"{clips.path}: {len(records)} readable training clips; a judge needs 2 at least")
     theirs, ours = ((clip["rgb"].shape, clip["actions"].shape) for clip in (records[0], first_clip(own)))
-    if theirs != ours:
+    fit = theirs == ours
+    if longer:
+        fit = theirs[0][1:] == ours[0][1:] and theirs[1][1:] == ours[1][1:] and theirs[0][0] >= ours[0][0]
+    if not fit:
         raise UserError(
             f"{clips.path}: the pictures and actions of its clips have the shapes {theirs}, those of the run's {ours}; "
             f"name clips of the run's length, size and actions"

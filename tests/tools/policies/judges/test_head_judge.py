@@ -14,7 +14,7 @@ from rsjax.config import StateHeadsConfig
 from rsjax.errors import UserError
 from rsjax.files import write_json
 from rsjax.models.base import TeacherForced
-from rsjax.tools.policies.judges.head_judge import HeadJudge, head_judge, head_rule, matching_shift
+from rsjax.tools.policies.judges.head_judge import HeadJudge, head_judge, head_rule, likeliest, matching_shift
 from rsjax.tools.policies.judges.judge import FAIL, SUCCESS, all_successes
 from rsjax.tools.policies.judges.judge_training import head_validation
 from rsjax.tools.policies.judges.trained_judge import Footage
@@ -64,7 +64,7 @@ def test_a_shifted_head_calls_as_many_videos_a_success_as_truly_are_one(in_a_row
     state = np.concatenate([state_of(p) for p in rng.random((20, 6))])
     success = np.zeros((20, 6), bool)
     success[rng.permutation(20)[:true], 3] = True
-    judge = HeadJudge(in_a_row, shift=matching_shift(state, success, in_a_row))
+    judge = HeadJudge(in_a_row, shift=matching_shift(likeliest(state, in_a_row), success.max(axis=1)))
     called = np.zeros(20, bool)
     for t in range(6):
         called |= judge.read(state[:, : t + 1]).argmax(-1) == SUCCESS

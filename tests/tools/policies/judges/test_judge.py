@@ -7,13 +7,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.special import logit
 
 from rsjax.clip import Video
+from rsjax.config import Config, StateHeadsConfig
 from rsjax.data.codec import decode, encode
-from rsjax.data.store import write_store
+from rsjax.data.store import Store, write_store
 from rsjax.errors import UserError
 from rsjax.tools.policies.judges import judge_training as judging
 from rsjax.tools.policies.judges import trained_judge as judge_module
+from rsjax.tools.policies.judges.head_judge import head_rule
 from rsjax.tools.policies.judges.judge import HISTORY, LABELS, SUCCESS, frames_of, last_frames
 from rsjax.tools.policies.judges.people_and_vlms import HumanJudge, LanguageJudge, answer_label, write_blinded
 from rsjax.tools.policies.judges.trained_judge import Footage, TrainedJudge, corrupted, load_judge, train_judge
@@ -178,6 +181,56 @@ def test_scores_agree_with_a_count_by_hand() -> None:
     assert result["calibration_error"] == pytest.approx((abs(0.9 - 1) + abs(0.7 - 0) + 2 * abs(0.6 - 0.5)) / 4)
 
 
+def use(monkeypatch: pytest.MonkeyPatch, model: Any, store: Store, config: Config | None = None) -> None:
+    """Makes a model and a store those of any run."""
+    trained = SimpleNamespace(config=config or toy.config(), model=model, params=None, assets=None)
+    monkeypatch.setattr(judging, "load", lambda run: trained)
+    monkeypatch.setattr(judging.Run, "open_clips", lambda self: store)
+
+
+class Telling:
+    """A model whose head reads the first number of a frame's action as the probability of success."""
+
+    def generate(self, params: Any, assets: Any, prompt: Video, actions: np.ndarray, **options: Any) -> Video:
+        state = np.repeat(np.clip(actions[..., :1], 0.01, 0.99), 3, axis=-1)
+        return Video(prompt.rgb.repeat(actions.shape[1], 1), state=state)
+
+    def teacher_forced(self, params: Any, assets: Any, video: Video, actions: np.ndarray, first: int) -> Video:
+        return self.generate(params, assets, video.frames(0, 1), actions).frames(first)
+
+
+def test_a_head_is_shifted_to_the_rate_of_clips_and_longer_episodes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It reads 0.9 in one frame of a third of them; of those, every other truly succeeds, and its reading is higher."""
+    store = toy.store(tmp_path / "clips")
+    use(monkeypatch, Telling(), store, toy.with_model(toy.config(), state_heads=StateHeadsConfig()))
+    stores = []
+    for frames in (6, 9):
+        records = []
+        for number in range(12):
+            record = vars(toy.clip(number)) | {"depth": None}
+            for name in ("rgb", "actions"):
+                record[name] = np.resize(record[name], (frames, *record[name].shape[1:]))
+            record["actions"][:, 0] = 0.2
+            record["success"] = np.zeros(frames, bool)
+            if number % 3 == 0:
+                record["actions"][frames - 2, 0] = 0.9 + 0.05 * (number % 2)
+                record["success"][-1] = number % 2
+            records.append(record)
+        write_store(tmp_path / str(frames), "clips", {"train": records}, {"success_share": 0.2})
+        stores.append(tmp_path / str(frames))
+    validated = judging.validate_heads(tmp_path / "run", tmp_path, also=stores)
+    rule = head_rule(tmp_path / "run")
+    assert rule.shift == validated["shift"]
+    assert -logit(0.95) < rule.shift < -logit(0.9)
+    small = [record | {"rgb": record["rgb"][:, ::2, ::2]} for record in records]
+    write_store(tmp_path / "small", "clips", {"train": small}, {"success_share": 0.2})
+    with pytest.raises(UserError) as raised:
+        judging.validate_heads(tmp_path / "run", tmp_path, also=[tmp_path / "small"])
+    assert "name clips of the run's length, size and actions" in str(raised.value)
+
+
 def test_a_runs_judge_is_made_and_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The toy's clips teach nothing, so a fresh network stands in for the result of its training."""
 
@@ -186,10 +239,7 @@ def test_a_runs_judge_is_made_and_saved(tmp_path: Path, monkeypatch: pytest.Monk
 
     judge = untrained_judge(64, temperature=2.0)
     run, store = tmp_path / "run", toy.store(tmp_path / "clips")
-    model = SimpleNamespace(generate=generate, reconstruct=lambda assets, video: video)
-    trained = SimpleNamespace(config=toy.config(), model=model, params=None, assets=None)
-    monkeypatch.setattr(judging, "load", lambda run: trained)
-    monkeypatch.setattr(judging.Run, "open_clips", lambda self: store)
+    use(monkeypatch, SimpleNamespace(generate=generate, reconstruct=lambda assets, video: video), store)
     seen: list[Footage] = []
 
     def train(learned: Footage, *_: object) -> TrainedJudge:
