@@ -238,7 +238,8 @@ def compare(
 ) -> dict[str, Any]:
     """Runs episodes in the simulator with each way to act, and returns success rates and times.
 
-    A :func:`folder` of the run gets the result too. It keeps finished episodes, so an interrupted comparison resumes.
+    A :func:`folder` of the run gets the result too. It keeps finished episodes, so an interrupted comparison resumes,
+    and one with more episodes goes on.
 
     Args:
         trained: the model of ``run``, which was trained on simulated clips.
@@ -275,7 +276,8 @@ def compare(
     elif settings.energy == "lpips":
         lpips = content_hash(Path(settings.lpips_weights))
     used = model_key(trained), judge_key(judge), *(policy.key for policy in policies.values())
-    key = content_key("plan", replace(settings, lpips_weights=lpips), config.sim, tuple(ways), used)
+    alike = replace(settings, lpips_weights=lpips, episodes=1)  # more episodes go on from these
+    key = content_key("plan", 2, alike, config.sim, tuple(ways), used)
     place = folder(run, key)
     total = settings.episodes * len(ways)
     with make_once(place, key, refuse=None) as work, Progress("episodes", total, "episodes") as progress:
@@ -292,8 +294,9 @@ def compare(
                         video = place / f"{name.replace('/', '-')}-{number:02d}.mp4"
                     done.append(_row(simulator, name, make(seed, goal), seed, video, settings.max_steps))
                     work.save(episodes=done)
-                progress.update(len(done))
-        result = _summary(done, settings, key, validation)
+                progress.update(min(len(done), total))
+        asked = [row for row in done if row["seed"] < FIRST_SEED + settings.episodes]
+        result = _summary(asked, settings, key, validation)
         write_json(place / "result.json", result)
         write_file(place / "results.md", results_text(result).encode())
     return result

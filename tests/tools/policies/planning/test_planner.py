@@ -367,6 +367,10 @@ def test_a_comparison_resumes_and_counts(model: TrainedModel, tmp_path: Path, mo
     assert keys[0] == keys[1] != keys[2]
     assert compare(model, tmp_path, SimulatorWorld([], 4, 7), settings) == result  # no episode is run again
     assert (place / "result.json").read_text() == saved
+    fewer = compare(model, tmp_path, SimulatorWorld([], 4, 7), replace(settings, episodes=2))
+    assert fewer["episodes"] == result["episodes"][:8] and fewer["ways"]["cem"]["episodes"] == 2
+    more = compare(model, tmp_path, lift(), replace(settings, episodes=4))  # it goes on
+    assert more["episodes"][:12] == result["episodes"] and more["ways"]["cem"]["episodes"] == 4
     with pytest.raises(UserError, match="no judge there; train one with rsjax judge"):
         compare(model, tmp_path, lift(), replace(settings, energy="judge"))
     with pytest.raises(ConfigError, match="needs lpips_weights"):
