@@ -22,7 +22,7 @@ class Options:
     """Ways to search."""
     energy: Literal["judge", "success", "tokens", "pixels", "lpips"] = "judge"
     """What to minimise at the horizon: 1 - the probability of success, by the judge (rsjax judge) or by the
-    model's own success head (shifted as rsjax judge --head left it); or the distance of the last frame to a goal
+    model's own success head (by the rule of rsjax judge --head); or the distance of the last frame to a goal
     image, which is the expert's last frame."""
     lpips_weights: str = ""
     """Weights for the energy lpips (docs/evaluation.md)."""
