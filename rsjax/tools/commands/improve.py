@@ -26,6 +26,8 @@ class Options(Improvement, Trials):
     """Directory of the policy to start with; default: train one on --demos real demonstrations."""
     demos: int = 50
     """Real demonstrations that the policy was, or is, trained on."""
+    demos_from: Path | None = None
+    """Store of these demonstrations; default: the run's clips."""
     size: str = "tiny"
     """Size of that policy: public, tiny or toy."""
     train_steps: int = 0
@@ -43,6 +45,8 @@ def main() -> None:
     """Writes results.json, results.md and success.png, and prints the table."""
     tune_process()
     options = parse_options(sys.argv[1:], "rsjax improve", Options.__doc__ or "", Options())
+    from rsjax.data.store import open_store
+    from rsjax.tools.policies.demos import load_demos
     from rsjax.tools.policies.policy import load_policy
     from rsjax.tools.policies.policy_training import train_policy
     from rsjax.tools.policies.run_data import RunData, sized_policy, with_clips
@@ -55,7 +59,11 @@ def main() -> None:
     trials = part(options, Trials)
     config = run.simulator  # checks the clips before a policy is trained
     model = run.world(trials.together, options.judge)
-    demos = run.demos().first(options.demos)
+    if options.demos_from:
+        demos = load_demos(open_store(options.demos_from), ["train"])
+    else:
+        demos = run.demos()
+    demos = demos.first(options.demos)
     if options.policy:
         policy = load_policy(options.policy)
     else:

@@ -30,8 +30,9 @@ def test_options_become_the_settings_of_each_part() -> None:
     learning = parsed("policy_learning", "runs/a", "--counts", "5", "10", "--episodes", "7", "--cells", "real-5")
     assert part(learning, Learning) == Learning((5, 10), cells=("real-5",))
     assert part(learning, Trials) == Trials(episodes=7) and learning.run == Path("runs/a")
-    improve = parsed("improve", "runs/a", "--rounds", "3", "--max-steps", "9")
-    assert part(improve, Improvement) == Improvement(rounds=3, max_steps=9) and part(improve, Trials).max_steps == 9
+    improve = parsed("improve", "runs/a", "--rounds", "3", "--max-steps", "9", "--follow-demos")
+    assert part(improve, Improvement) == Improvement(rounds=3, max_steps=9, follow_demos=True)
+    assert part(improve, Trials).max_steps == 9
     made = parsed("synthesize", "runs/a", "--demos", "3", "--noise", "0.5", "--judge")
     assert part(made, Synthesis) == Synthesis(3, noise=0.5) and made.judge
     assert parsed("policy_evaluation", "runs/a", "runs/b").runs == (Path("runs/a"), Path("runs/b"))

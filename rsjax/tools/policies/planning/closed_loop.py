@@ -201,7 +201,7 @@ def actors(
     if settings.warm_start:
         proposals |= {name: rolling(policy) for name, policy in policies.items()}
     if clips is not None:
-        ways[SIMILAR] = lambda seed, goal: lambda observation: clips.ways(observation["rgb"][0], 1, 1)[:, 0]
+        ways[SIMILAR] = lambda seed, goal: clips.actor(seed)
         proposals[SIMILAR] = lambda seed: lambda recent: clips.ways(recent.rgb[-1], half, horizon)
     for method in settings.methods:
         ways[method] = planning(method)

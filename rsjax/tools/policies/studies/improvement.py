@@ -1,4 +1,7 @@
-"""Improves a policy in imagination: it acts in the world model, and learns from what the judge calls a success."""
+"""Improves a policy in imagination: it learns from episodes in the world model that the judge calls a success.
+
+The policy itself acts in them, or they follow its demonstrations from new first frames.
+"""
 
 import math
 from collections.abc import Sequence
@@ -18,6 +21,7 @@ from rsjax.files import write_file, write_json
 from rsjax.progress import Progress, note, stage
 from rsjax.tools.policies.demos import Demos
 from rsjax.tools.policies.judges.validation import markdown, summary
+from rsjax.tools.policies.planning.proposals import SimilarClips, similar_demos
 from rsjax.tools.policies.policy import Policy
 from rsjax.tools.policies.policy_training import train_policy
 from rsjax.tools.policies.studies.figures import success_curves
@@ -49,6 +53,8 @@ class Improvement:
         steps: fine-tuning steps in each round.
         share: share of old demonstrations in the data for fine-tuning, at least 0 and below 1.
         learning_rate: learning rate of fine-tuning, as a share of the training's.
+        follow_demos: whether imagined episodes follow, at every frame, the old demonstration that looks most alike,
+            instead of the policy. It then learns in which first frames its demonstrations work, and how these look.
     """
 
     rounds: int = 2
@@ -57,6 +63,7 @@ class Improvement:
     steps: int = 500
     share: float = 0.5
     learning_rate: float = 0.3
+    follow_demos: bool = False
 
     def __post_init__(self) -> None:
         for name in ("rounds", "imagined", "max_steps", "steps"):
@@ -103,7 +110,10 @@ def improve(
         stage(
             number, settings.rounds, f"round {number}", f"{settings.imagined} imagined episodes, {settings.steps} steps"
         )
-        made, counts = imagine(arms["imagined"], starts, model, settings, number, out / f"round-{number}" / "episodes")
+        actors: Policy | SimilarClips = arms["imagined"]
+        if settings.follow_demos:
+            actors = similar_demos(demos)
+        made, counts = imagine(actors, starts, model, settings, number, out / f"round-{number}" / "episodes")
         row: dict[str, Any] = {"round": number, "episodes": settings.imagined, "kept": len(made), "demos": len(demos)}
         row |= {"uninterpretable": counts["uninterpretable"], "clipped": {"imagining": counts["clipped"]}}
         for arm, old in arms.items():
@@ -131,9 +141,17 @@ def improve(
 
 
 def imagine(
-    policy: Policy, starts: Sequence[FirstFrame], model: World, settings: Improvement, number: int, folder: Path
+    actors: Policy | SimilarClips,
+    starts: Sequence[FirstFrame],
+    model: World,
+    settings: Improvement,
+    number: int,
+    folder: Path,
 ) -> tuple[list[Record], dict[str, int]]:
     """Imagines the episodes of a round, except those that an interrupted call left in ``folder``.
+
+    Args:
+        actors: who acts in them.
 
     Returns:
         The episodes that the judge calls successes, as demonstrations; and over all episodes, how many end in a frame
@@ -143,7 +161,7 @@ def imagine(
     # A start that is used again gets different draws.
     chosen = [replace(starts[place % len(starts)], draw=place) for place in range(begins, begins + settings.imagined)]
     first_frames = fingerprint([(start.rgb, start.depth, start.draw) for start in chosen])
-    key = content_key("imagined", policy.key, model.key, model.count, settings.max_steps, first_frames)
+    key = content_key("imagined", actors.key, model.key, model.count, settings.max_steps, first_frames)
     made: list[Record] = []
     uninterpretable = 0
     clipped = 0
@@ -155,7 +173,7 @@ def imagine(
             group = chosen[first : first + model.count]
             file = folder / f"{first:05d}.clips"
             if not file.exists():
-                episodes = run_episodes(model, policy.actor(begins + first), group, settings.max_steps)
+                episodes = run_episodes(model, actors.actor(begins + first), group, settings.max_steps)
                 good = [{"rgb": one.rgb, "actions": one.actions} for one in episodes if one.success.any()]
                 content = {
                     "clips": [encode(one) for one in good],

@@ -21,13 +21,14 @@ from rsjax.tools.policies.planning import energies
 from rsjax.tools.policies.planning.closed_loop import PlanSettings, compare, energy_of, folder, results_text
 from rsjax.tools.policies.planning.energies import RecentFrames, imagined, judged, pixel_distance, token_distance
 from rsjax.tools.policies.planning.planner import Planner, PlannerConfig, search
-from rsjax.tools.policies.planning.proposals import policy_rollouts, similar_clips
+from rsjax.tools.policies.planning.proposals import policy_rollouts, similar_clips, similar_demos
 from rsjax.tools.policies.worlds.model_world import FirstFrame, ModelWorld
 from rsjax.tools.policies.worlds.simulator_world import SimulatorWorld
 from rsjax.tools.policies.worlds.world import run_episodes
 from rsjax.tools.sim.expert import LiftState
 from tests.models.toy_family import ToyConfig
 from tests.tools.pipeline import toy
+from tests.tools.policies.toy import demos
 from tests.tools.policies.toy_worlds import ToySimulator
 
 LOW, HIGH = -np.ones(2), np.ones(2)
@@ -277,6 +278,15 @@ def test_similar_clips_are_followed_from_their_most_similar_frame_before_success
     with pytest.raises(UserError) as refused:
         similar_clips(lifts(99, 0))
     assert "clips: none of its training clips succeeds" in str(refused.value)
+
+
+def test_demonstrations_are_followed_up_to_their_last_frames_in_several_episodes_at_once() -> None:
+    similar = similar_demos(demos(3))
+    frames = np.stack([demos(3)[1]["rgb"][4], demos(3)[0]["rgb"][-1]])
+    actions = similar.actor()({"rgb": frames})
+    np.testing.assert_array_equal(actions[0], demos(3)[1]["actions"][5])
+    np.testing.assert_array_equal(actions[1], demos(3)[2]["actions"][-1])  # the last frame but one looks like this, too
+    assert similar.key != similar_demos(demos(2)).key == similar_demos(demos(2)).key
 
 
 def test_the_distance_of_tokens_counts_bits(model: TrainedModel) -> None:

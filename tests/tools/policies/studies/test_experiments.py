@@ -256,15 +256,21 @@ def test_checkpoints_go_from_the_first_steps_to_the_last(
     assert "20 training steps have 6 stages, not 8; more steps, or fewer checkpoints" in capsys.readouterr().out
 
 
-def test_imagined_successes_are_learnt_from(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    learnt: dict[str, tuple[int, float]] = {}
+@pytest.fixture
+def learnt(monkeypatch: pytest.MonkeyPatch) -> dict[str, tuple[Any, float]]:
+    """Demonstrations and learning rate of each training, which makes policies faster by imagined ones alone."""
+    found: dict[str, tuple[Any, float]] = {}
 
     def train(config: Any, source: Any, directory: Path, *, name: str, seed: int, start: ToyPolicy) -> ToyPolicy:
-        learnt[name] = (len(source), config.train.optimizer.learning_rate)
+        found[name] = (source, config.train.optimizer.learning_rate)
         assert config.train.steps == 7
         return ToyPolicy(start.speed + (0.1 if name.endswith("imagined") else 0), replace(start.model, config=config))
 
     monkeypatch.setattr(improvement, "train_policy", train)
+    return found
+
+
+def test_imagined_successes_are_learnt_from(tmp_path: Path, learnt: dict[str, tuple[Any, float]]) -> None:
     settings = Improvement(rounds=2, imagined=10, max_steps=4, steps=7, share=0.5, learning_rate=0.5)
     starts = first_frames(simulated(5), list(range(10)), tmp_path / "starts.npz")
     draws: list[list[int]] = []
@@ -274,7 +280,7 @@ def test_imagined_successes_are_learnt_from(tmp_path: Path, monkeypatch: pytest.
     assert draws[0] == [0, 1, 2, 3, 4] and draws[2] == [10, 11, 12, 13, 14]  # a second round has other draws
     kept = [row["kept"] for row in results["rounds"]]
     assert kept == [2, 4]  # of columns 0 … 4 twice, those from which 4 steps at this speed come to column 10
-    assert {name: count for name, (count, _) in learnt.items()} == {
+    assert {name: len(source) for name, (source, _) in learnt.items()} == {
         "round 1 imagined": 4,
         "round 1 control": 3,
         "round 2 imagined": 8,
@@ -293,6 +299,19 @@ def test_imagined_successes_are_learnt_from(tmp_path: Path, monkeypatch: pytest.
     other = imagined(5, pace=0.5, draws=drawn)  # a model of other weights imagines anew
     made, counts = improvement.imagine(inputs[0], starts, other, settings, 1, tmp_path / "round-1" / "episodes")
     assert not made and counts == {"uninterpretable": 0, "clipped": 0} and len(drawn) == 2
+
+
+def test_imagined_episodes_may_follow_the_old_demonstrations(
+    tmp_path: Path, learnt: dict[str, tuple[Any, float]]
+) -> None:
+    settings = Improvement(rounds=1, imagined=10, max_steps=4, steps=7, share=0, follow_demos=True)
+    starts = first_frames(simulated(5), list(range(10)), tmp_path / "starts.npz")
+    still: Any = ToyPolicy(0)
+    results = improve(still, demos(5), starts, imagined(5), simulated(5), settings, TRIALS, tmp_path)
+    assert results["settings"]["follow_demos"] and results["rounds"][0]["kept"] == 6  # from columns 2, 3 and 4, twice
+    first = learnt["round 1 imagined"][0][0]
+    np.testing.assert_array_equal(first["rgb"], demos(5)[0]["rgb"][1:6])  # it begins as the second frame of this one
+    np.testing.assert_array_equal(first["actions"][1:], demos(5)[0]["actions"][2:6])
 
 
 def test_old_demonstrations_are_the_share_that_is_asked_for() -> None:
