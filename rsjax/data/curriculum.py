@@ -147,6 +147,17 @@ def choose(part: ComponentConfig, store: Store) -> np.ndarray | None:
     return chosen[: part.clips or None]
 
 
+def record_count(part: ComponentConfig, own: Store) -> int:
+    """Returns how many records a component draws from.
+
+    Raises:
+        StoreError: its store cannot be read, or no record passes its patterns.
+    """
+    store = open_store(part.store) if part.store else own
+    chosen = choose(part, store)
+    return len(store.source(SPLIT)) if chosen is None else len(chosen)
+
+
 def _resolve(stage: CurriculumStageConfig, batch_size: int, own: Store, transform: Transform) -> CurriculumStage:
     components = []
     for config in stage.components:

@@ -18,6 +18,7 @@ from jaxtyping import Float
 from rsjax.artifact import Work, make_once
 from rsjax.config import ComponentConfig, Config, CurriculumStageConfig, TokenModelConfig, content_key
 from rsjax.config.config_fields import with_values
+from rsjax.data.curriculum import record_count
 from rsjax.data.store import Store, open_store
 from rsjax.errors import UserError
 from rsjax.evaluation.results import Result, read_result
@@ -142,7 +143,7 @@ def adapt(data: RunData, behaviour: Behaviour, settings: Adaptation, out: Path, 
             stores.append(clips.path)
             tokens = [prepare_store(data.run, data.config, open_store(place)).path for place in stores]
             start = list(runs.values())[-1]
-            config = adapted(data, tokens, start, settings, count, number)
+            config = adapted(data.config, data.clips, tokens, start, settings, count, number)
             runs[f"round-{number}"] = train(config, data, out / f"round-{number}", command)
         return measure(data, behaviour, settings, runs, stores[0], count, out)
 
@@ -189,25 +190,29 @@ def on_policy_clips(data: RunData, behaviour: Behaviour, settings: Adaptation, n
 
 
 def adapted(
-    data: RunData, tokens: Sequence[Path], start: Path, settings: Adaptation, steps: int, number: int
+    config: Config, own: Store, tokens: Sequence[Path], start: Path, settings: Adaptation, steps: int, number: int
 ) -> Config:
     """Returns the configuration of a round's run: the run's own, from ``start``, on its clips and the on-policy ones.
 
+    Of the run's own clips it draws as the run did at the end, in the last stage of its curriculum.
+
     Args:
+        config: the run's configuration.
+        own: the run's clips.
         tokens: the prepared stores of the on-policy clips.
         start: the run whose weights training starts from; its tokenizer stays as it is.
     """
-    config = data.config
-    if config.train.curriculum and number == 1:
-        note(f"{data.run}: was trained by a curriculum; the adaptation draws from its own clips and the new ones alone")
-    own = len(data.clips.source("train"))
+    last = (CurriculumStageConfig(), *config.train.curriculum)[-1]
+    total = sum(part.weight for part in last.components)
+    old = [replace(part, weight=(1 - settings.share) * part.weight / total) for part in last.components]
     counts = [len(open_store(place).source("train")) for place in tokens]
-    components = [ComponentConfig(weight=1 - settings.share)]
-    for place, count in zip(tokens, counts, strict=True):
-        weight = settings.share * count / sum(counts)
-        components.append(ComponentConfig(store=str(place.absolute()), weight=weight))
+    new = [
+        ComponentConfig(store=str(place.absolute()), weight=settings.share * count / sum(counts))
+        for place, count in zip(tokens, counts, strict=True)
+    ]
+    components = (*old, *new)
     loop = config.train
-    epochs = steps * loop.batch_size / (own + sum(counts))
+    epochs = steps * loop.batch_size / sum(record_count(part, own) for part in components)
     optimizer = replace(
         loop.optimizer,
         learning_rate=settings.learning_rate * loop.optimizer.learning_rate,
@@ -221,7 +226,7 @@ def adapted(
             loop,
             start_from=begin,
             steps=steps,
-            curriculum=(CurriculumStageConfig(tuple(components), epochs=epochs),),
+            curriculum=(CurriculumStageConfig(components, epochs=epochs, frames=last.frames),),
             optimizer=optimizer,
             seed=loop.seed + number,
         ),

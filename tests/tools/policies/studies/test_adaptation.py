@@ -13,6 +13,8 @@ import jax
 import numpy as np
 import pytest
 
+from rsjax.config import ComponentConfig, CurriculumStageConfig
+from rsjax.config.config_fields import with_values
 from rsjax.data.store import open_store
 from rsjax.models.load_run import load
 from rsjax.tools.policies.config import toy
@@ -115,10 +117,23 @@ def test_a_second_round_starts_from_the_first_and_learns_from_both_rounds_episod
     data = RunData(place.run, command.data)
     before = place.out / "round-1"
     _, new = load(before).config.train.curriculum[0].components
-    config = adapted(data, [Path(new.store)] * 2, before, Adaptation(rounds=2), 4, 2)
+    config = adapted(data.config, data.clips, [Path(new.store)] * 2, before, Adaptation(rounds=2), 4, 2)
     assert config.train.start_from == config.tokenizer_train.start_from == str(before)
     assert [part.weight for part in config.train.curriculum[0].components] == [0.5, 0.25, 0.25]
     assert config.train.seed == data.config.train.seed + 2
+
+
+def test_of_its_own_clips_a_run_draws_as_in_the_last_stage_of_its_curriculum(place: Place, command: Commands) -> None:
+    data = RunData(place.run, command.data)
+    new = place.out / "on-policy-1" / "clips"
+    parts = (ComponentConfig(clips=2, weight=3.0), ComponentConfig(clips=1, weight=1.0))
+    stages = (CurriculumStageConfig(epochs=9), CurriculumStageConfig(parts, epochs=9, frames=3))
+    config = with_values(data.config, {"train.curriculum": stages})
+    changed = adapted(config, data.clips, [new], place.run, Adaptation(share=0.2), 7, 1)
+    (stage,) = changed.train.curriculum
+    assert [part.weight for part in stage.components] == pytest.approx([0.6, 0.2, 0.2]) and stage.frames == 3
+    assert [part.clips for part in stage.components] == [2, 1, 0] and stage.components[2].store == str(new)
+    assert stage.epochs * (2 + 1 + 4) == 7 * config.train.batch_size
 
 
 def test_a_call_on_the_episodes_that_is_killed_and_runs_again_gives_the_same_bytes_as_the_policies_whole_call(
