@@ -65,7 +65,7 @@ class Options:
     test_share: float = 0.2
     """Share of the episodes that scores are of; no training sees them."""
     validation_share: float = 0.1
-    """Share of the episodes that decide when a training stops."""
+    """Share of the episodes that choose the best weights and, with --patience, end a training early."""
     split_seed: int = 0
     """Another number chooses other episodes for both."""
     workers: int = -1

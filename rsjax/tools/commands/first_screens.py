@@ -26,7 +26,7 @@ class FirstScreen:
     takes: str = ""
 
 
-TINY = "tiny takes 15 to 52 minutes on 2 CPU cores (docs/commands.md says which), debug about a minute"
+TINY = "tiny takes 15 to 55 minutes on 2 CPU cores (docs/commands.md says which), debug about a minute"
 
 FIRST_SCREENS = {
     "demo": FirstScreen(

@@ -29,7 +29,7 @@ from rsjax.tools.studies.report.figures import ClipFigure, filmstrip
 from rsjax.trainable import Params
 from rsjax.training.validation import Validation, validation_loss
 
-LOSS_CLIPS = 1000  # spread evenly over the test split; more would only take time
+LOSS_CLIPS = 1000  # spread evenly over the held-out split; more would only take time
 
 
 @dataclass(frozen=True)
