@@ -54,7 +54,7 @@ def main() -> None:
     if not options.policy and not options.episodes:
         raise ConfigError("name policies with --policy DIR, recorded episodes with --episodes STORE, or both")
     from rsjax.data.store import open_store
-    from rsjax.tools.policies.policy import load_policy
+    from rsjax.tools.policies.policy import check_fits, load_policy
     from rsjax.tools.policies.run_data import RunData, named
     from rsjax.tools.policies.studies.adaptation import Behaviour, adapt, scores_of
     from rsjax.tools.policies.studies.trials import Trials, open_lift
@@ -72,7 +72,11 @@ def main() -> None:
         simulator = None
         if policies:
             config = data.simulator
-            data.world_judge(options.judge)  # checked before minutes of work
+            # Checked before minutes of work:
+            data.check_world(data, options.judge)
+            data.world_judge(options.judge)
+            for name, policy in policies.items():
+                check_fits(policy, data.config.clips, name)
             simulator = stack.enter_context(open_lift(config, trials))
         behaviour = Behaviour(policies, simulator, trials, options.judge, options.episodes)
         adapt(data, behaviour, part(options, Adaptation), out, shlex.join([*PROG.split(), *sys.argv[1:]]))

@@ -47,7 +47,7 @@ def main() -> None:
     options = parse_options(sys.argv[1:], "rsjax improve", Options.__doc__ or "", Options())
     from rsjax.data.store import open_store
     from rsjax.tools.policies.demos import load_demos
-    from rsjax.tools.policies.policy import load_policy
+    from rsjax.tools.policies.policy import check_fits, load_policy
     from rsjax.tools.policies.policy_training import train_policy
     from rsjax.tools.policies.run_data import RunData, sized_policy, with_clips
     from rsjax.tools.policies.studies.improvement import improve
@@ -66,9 +66,10 @@ def main() -> None:
     demos = demos.first(options.demos)
     if options.policy:
         policy = load_policy(options.policy)
+        check_fits(policy, run.config.clips, "--policy")
     else:
         policy = train_policy(sized_policy(options.size, options.train_steps), demos, out / "policy")
-    starts = run.first_frames(settings.imagined * settings.rounds)
+    starts = run.first_frames(settings.imagined * settings.rounds + len(demos))
     with open_lift(config, trials) as simulator:
         improve(policy, demos, starts, model, simulator, settings, trials, out)
     print((out / "results.md").read_text(), out, sep="\n")

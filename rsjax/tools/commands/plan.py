@@ -74,7 +74,7 @@ def main() -> None:
     check_together(trained.config, options.candidates, options.horizon, at_once)
     policies: dict[str, Any] = {}
     if options.policy:
-        policies[f"policy {options.policy}"] = load_policy(options.policy)
+        policies["policy"] = load_policy(options.policy)
     clips = None
     if options.from_clips:
         clips = RunData(options.run, options.data_dir).clips

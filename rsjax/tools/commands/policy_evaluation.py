@@ -56,7 +56,7 @@ def main() -> None:
         )
     from rsjax.tools.policies.judges.head_judge import head_rule
     from rsjax.tools.policies.judges.judge_training import FOLDER
-    from rsjax.tools.policies.policy import common_size, load_policy
+    from rsjax.tools.policies.policy import check_fits, load_policy
     from rsjax.tools.policies.run_data import RunData, named, replicates, sized_policy, training_of
     from rsjax.tools.policies.studies.policy_evaluation import check_imagined, compare, trained_policies
     from rsjax.tools.policies.studies.rejudging import blind, named_judge, rejudge
@@ -89,7 +89,8 @@ def main() -> None:
         demos = first.demos().first(options.demos)
         size = sized_policy(options.size, options.steps)
         policies, training = trained_policies(size, demos, out, options.checkpoints, options.trainings)
-    common_size(policies.values())
+    for name, policy in policies.items():
+        check_fits(policy, first.config.clips, name)
     worlds = {name: partial(run.world, trials.together, judge, measured=True, rule=rule) for name, run in runs.items()}
     with open_lift(config, trials) as simulator:
         compare(

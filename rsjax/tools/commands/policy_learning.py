@@ -6,6 +6,7 @@ from pathlib import Path
 
 import tyro
 
+from rsjax.errors import UserError
 from rsjax.runtime import tune_process
 from rsjax.tools.commands.cli import main_errors, parse_options, part
 from rsjax.tools.policies.studies.policy_learning import Learning
@@ -34,6 +35,8 @@ class Options(Learning, Trials):
     def __post_init__(self) -> None:
         Learning.__post_init__(self)
         Trials.__post_init__(self)
+        if self.seed < 0:
+            raise UserError(f"--seed is {self.seed}; it must be at least 0")
 
 
 @main_errors()

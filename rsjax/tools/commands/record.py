@@ -40,17 +40,22 @@ def main() -> None:
     tune_process()
     options = parse_options(sys.argv[1:], "rsjax record", Options.__doc__ or "", Options())
     if not options.policies or min(options.episodes, options.together) < 1 or options.max_steps < 0:
-        raise ConfigError("name a policy at least, and --episodes and --together of 1 or more: --policies DIR")
+        raise ConfigError(
+            f"--policies names {len(options.policies)}, --episodes is {options.episodes}, --together "
+            f"{options.together}, --max-steps {options.max_steps}: 1, 1, 1 and 0 at least"
+        )
     from rsjax.config import content_key
     from rsjax.processes import count_cores
     from rsjax.tools.policies.on_policy import rollouts
-    from rsjax.tools.policies.policy import common_size, load_policy
+    from rsjax.tools.policies.policy import check_fits, load_policy
     from rsjax.tools.policies.run_data import RunData, named
     from rsjax.tools.policies.worlds.simulator_world import SimulatorWorld
 
-    config = RunData(options.run, options.data_dir).simulator
+    data = RunData(options.run, options.data_dir)
+    config = data.simulator
     policies = {name: load_policy(place) for name, place in named(options.policies).items()}
-    common_size(policies.values())
+    for name, policy in policies.items():
+        check_fits(policy, data.config.clips, name)
     total = options.episodes * len(policies)
     numbers = {"train": range(FIRST, FIRST + total)}
     keys = str([policy.key for policy in policies.values()])

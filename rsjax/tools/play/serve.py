@@ -25,8 +25,7 @@ from rsjax.tools.play.messages import UPLOAD_BYTES, Refused
 from rsjax.tools.play.play_run import PlayRun
 from rsjax.tools.play.server import make_app
 from rsjax.tools.play.session import first_settings
-from rsjax.tools.play.sources import check_policy
-from rsjax.tools.policies.policy import load_policy
+from rsjax.tools.policies.policy import check_fits, load_policy
 from rsjax.tools.policies.run_data import RunData
 
 
@@ -66,7 +65,8 @@ def serve(data: RunData, policy: Path | None, split: str, out: Path, settings: S
         data.clips  # noqa: B018 - a store that was named has to be there; a run's own may be missing
     run = PlayRun(data, split, load_policy(policy) if policy else None, out)
     engine = Engine(run.trained, settings.lanes)
-    check_policy(run)
+    if run.policy is not None:
+        check_fits(run.policy, data.config.clips, "--policy")
     listener = listen(settings.host, settings.port)
     guard = Guard("" if is_loopback(settings.host) else secrets.token_urlsafe(16))
     if run.missing:

@@ -111,17 +111,3 @@ def _energy(run: PlayRun) -> EnergyName:
     if getattr(run.data.config.model, "state_heads", None) is None:
         return "judge"
     return "success"
-
-
-def check_policy(run: PlayRun) -> None:
-    """Raises :class:`UserError` if the policy's frames or actions differ in size from the run's."""
-    if run.policy is None:
-        return
-    clips = run.data.config.clips
-    own = (run.policy.model.image_size, run.policy.action_dim)
-    wanted = (clips.image_size, clips.action_dim)
-    if own != wanted:
-        raise UserError(
-            f"--policy: the policy sees {own[0]} pixels and answers with {own[1]} numbers; the run has {wanted[0]} "
-            f"and {wanted[1]}"
-        )

@@ -29,7 +29,7 @@ from rsjax.tools.sim.collect import Collection, make_store
 from rsjax.tools.sim.episode import POLICY, WINDOW, EpisodePlan, Replay, clip_seed
 from rsjax.tools.sim.unseen import UNITS
 
-FIRST_EPISODE = 2**20  # the numbers of a run's own episodes are smaller, so none starts like one of these
+FIRST_EPISODE = 2**20  # a run's own episodes have other numbers (sim/recipes/plans.py), so none starts like these
 RECIPE = 2  # raise when the same episodes give other clips
 
 

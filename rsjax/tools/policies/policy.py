@@ -3,7 +3,6 @@
 Axes: B episodes, O observed frames, S×S pixels, H controls of a plan, D numbers of a control, A = k·D of an action.
 """
 
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -13,7 +12,7 @@ import jax
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from rsjax.config import ConfigError, LoopConfig, content_key, from_dict, to_dict
+from rsjax.config import ClipShape, ConfigError, LoopConfig, content_key, from_dict, to_dict
 from rsjax.errors import UserError
 from rsjax.evaluation.results import fingerprint
 from rsjax.files import disk_guard, read_json, write_json
@@ -150,13 +149,19 @@ def _plan(model: DiffusionPolicy, params: Params, frames: Any, key: Any) -> Any:
     return model.plan(params, frames, key)
 
 
-def common_size(policies: Iterable[Policy]) -> int:
-    """Returns the common image size of the policies in a comparison.
+def check_fits(policy: Policy, clips: ClipShape, name: str) -> None:
+    """Checks that a policy sees frames and returns actions of the sizes of a run's clips.
+
+    Args:
+        name: of the policy.
 
     Raises:
-        UserError: the policies differ in image size.
+        UserError: it does not.
     """
-    sizes = {policy.model.image_size for policy in policies}
-    if len(sizes) != 1:
-        raise UserError(f"the policies see frames of {sorted(sizes)} pixels; compare policies of one size")
-    return sizes.pop()
+    own = (policy.model.image_size, policy.action_dim)
+    wanted = (clips.image_size, clips.action_dim)
+    if own != wanted:
+        raise UserError(
+            f"{name}: the policy sees {own[0]} pixels and answers with {own[1]} numbers; the run's clips have "
+            f"{wanted[0]} and {wanted[1]}"
+        )

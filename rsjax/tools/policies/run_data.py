@@ -4,7 +4,6 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import islice
 from pathlib import Path
 
 from rsjax.config import Config, SimConfig, content_key, from_dict
@@ -86,9 +85,10 @@ class RunData:
             measured: whether to measure how far episodes are from the training clips.
 
         Raises:
-            UserError: the run is unfinished, its model takes no actions, or there is no judge for its frames.
+            UserError: the run is unfinished, its model takes no actions or reads a second view, or there is no judge
+                for its frames.
         """
-        check_takes_actions(self.config.model, f"{self.run}: the model")
+        self._check_model()
         coverage = None
         if measured:
             coverage = make_coverage(self.trained, self.clips, self.run)
@@ -117,10 +117,10 @@ class RunData:
             judge: as of :meth:`world_judge`.
 
         Raises:
-            UserError: the run is unfinished, its model takes no actions or lacks the judge's heads, or frames or
-                actions differ in size.
+            UserError: the run is unfinished, its model takes no actions, reads a second view or lacks the judge's
+                heads, or frames or actions differ in size.
         """
-        check_takes_actions(self.config.model, f"{self.run}: the model")
+        self._check_model()
         if judge == Path(HEAD):
             check_heads(self.config.model, str(self.run))
         shapes = [(clips.image_size, clips.action_dim) for clips in (self.config.clips, like.config.clips)]
@@ -132,6 +132,14 @@ class RunData:
         if not has_weights(self.run, "world_model"):
             raise UserError(f"{self.run}: its world model is not trained yet; the train command of this run goes on")
 
+    def _check_model(self) -> None:
+        check_takes_actions(self.config.model, f"{self.run}: the model")
+        if self.config.second_view:
+            raise UserError(
+                f"{self.run}: its model reads a second view (sim.second_view), which episodes of policies do not have; "
+                f"take a run without it"
+            )
+
     def judge(self, folder: Path | None = None) -> Judge:
         """Returns the run's judge, or the one in another folder.
 
@@ -140,23 +148,25 @@ class RunData:
         """
         return load_judge(folder or self.run / FOLDER, self.config.clips.image_size)
 
-    def first_frames(self, count: int, split: str = "train") -> list[FirstFrame]:
-        """Returns the first frames of ``count`` clips that begin as their episodes do, with depth if they have it.
+    def first_frames(self, count: int) -> list[FirstFrame]:
+        """Returns the first frames of training clips that begin as their episodes do, with depth if they have it.
+
+        At most ``count``, all different: paired grasps begin with the same frame.
 
         Raises:
-            UserError: no clip does.
+            UserError: no clip begins as its episode does.
         """
-        clips = readable(self.clips.source(split))
-        chosen = islice((pair for pair in clips if begins_episode(pair[1])), count)
-        starts = [
-            FirstFrame(clip["rgb"][0], None if clip["depth"] is None else clip["depth"][0], number, number)
-            for number, clip in chosen
-        ]
+        starts: dict[bytes, FirstFrame] = {}
+        for number, clip in readable(self.clips.source("train")):
+            if len(starts) == count:
+                break
+            if begins_episode(clip):
+                rgb = clip["rgb"][0]
+                depth = None if clip["depth"] is None else clip["depth"][0]
+                starts.setdefault(rgb.tobytes(), FirstFrame(rgb, depth, number, number))
         if not starts:
-            raise UserError(
-                f"{self.clips.path}, split {split}: no clip begins as its episode does, so nothing can start"
-            )
-        return starts
+            raise UserError(f"{self.clips.path}: no training clip begins as its episode does, so nothing can start")
+        return list(starts.values())
 
     def demos(self, only: Only = "success", seed: int = 0) -> Demos:
         """Returns the run's training clips as demonstrations."""

@@ -293,7 +293,7 @@ def begins_episode(clip: Record) -> bool:
 
 
 def clip_seed(provenance: dict[str, Any]) -> int:
-    """Returns the seed with which a simulator's ``reset`` starts where a simulated clip started."""
+    """Returns the seed with which a simulator's ``reset`` starts where a simulated clip's episode started."""
     return int(np.random.default_rng([provenance["seed"], provenance["episode"]]).integers(2**32))
 
 

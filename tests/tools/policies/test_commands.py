@@ -48,6 +48,8 @@ def test_options_become_the_settings_of_each_part() -> None:
         ("adapt", ("--share", "1"), "--share is 1.0; it is a share"),
         ("adapt", ("--rounds", "3"), "--rounds is 3; it is 1 or 2"),
         ("synthesize", ("--noise", "nan"), "--noise nan: 1, 1 and 0 at least"),
+        ("synthesize", ("--seed", "-1"), "--seed -1: 0 at least"),
+        ("policy_learning", ("--seed", "-1"), "--seed is -1; it must be at least 0"),
         ("synthesize", ("--demo", "3"), "did you mean '--demos'"),
     ],
 )

@@ -1,6 +1,7 @@
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from rsjax.data.codec import Record
 from rsjax.errors import UserError
 from rsjax.files import write_json
 from rsjax.tools.policies.demos import is_demo
+from rsjax.tools.policies.policy import check_fits
 from rsjax.tools.policies.run_data import RunData, replicates, training_of
 from rsjax.tools.sim.episode import WINDOW
 from tests.tools.policies.toy_worlds import untrained_judge
@@ -38,6 +40,10 @@ def test_runs_in_which_no_policy_can_act_are_named_before_any_training(tmp_path:
     small = run(tmp_path / "small", replace(config, sim=longer))
     with pytest.raises(UserError, match=r"small: frames of 64 pixels and actions of 35 .*first has 64 and 28"):
         small.check_world(first)
+    double = run(tmp_path / "double", replace(config, sim=replace(config.sim, second_view="wrist")))
+    with pytest.raises(UserError) as refused:
+        double.check_world(first)
+    assert "its model reads a second view (sim.second_view)" in str(refused.value)
     headless = run(tmp_path / "headless", config)
     headless.check_world(first, first.run / "judge")
     with pytest.raises(UserError) as refused:
@@ -47,15 +53,27 @@ def test_runs_in_which_no_policy_can_act_are_named_before_any_training(tmp_path:
         run(tmp_path / "new", config, trained=False).check_world(first)
 
 
+def test_a_policy_of_other_sizes_is_named() -> None:
+    policy: Any = SimpleNamespace(model=SimpleNamespace(image_size=64), action_dim=28)
+    check_fits(policy, presets.debug().clips, "policy")
+    policy.action_dim = 7
+    with pytest.raises(UserError) as refused:
+        check_fits(policy, presets.debug().clips, "policy")
+    assert str(refused.value).endswith("sees 64 pixels and answers with 7 numbers; the run's clips have 64 and 28")
+
+
 def test_episodes_start_and_demonstrations_begin_as_episodes_do(tmp_path: Path) -> None:
     def clip(window: int, success: bool) -> Record:
         frames = np.full((2, 4, 4, 3), window, np.uint8)
         return {"rgb": frames, "depth": None, "provenance": {WINDOW: window}, "success": np.array([False, success])}
 
     clips = [clip(7, True), clip(0, True), clip(0, False)]
+    clips[2]["rgb"][0] = 1
+    pair = [*clips, clip(0, True)]
     data = run(tmp_path / "run", presets.debug())
-    vars(data)["clips"] = SimpleNamespace(source=lambda split: clips)
-    assert [(start.clip, start.rgb.max()) for start in data.first_frames(2)] == [(1, 0), (2, 0)]
+    vars(data)["clips"] = SimpleNamespace(source=lambda split: pair)
+    assert [(start.clip, start.rgb.max()) for start in data.first_frames(9)] == [(1, 0), (2, 1)]
+    assert [start.clip for start in data.first_frames(1)] == [1]
     assert [is_demo(each, "success", True) for each in clips] == [False, True, False]
     assert [is_demo(each, "success", False) for each in clips] == [False, True, True]
     assert all(is_demo(each, "all", True) for each in clips)

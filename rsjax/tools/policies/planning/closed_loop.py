@@ -40,7 +40,7 @@ from rsjax.tools.policies.planning.energies import (
 )
 from rsjax.tools.policies.planning.planner import Energy, Planner, PlannerConfig, Propose
 from rsjax.tools.policies.planning.proposals import SimilarClips, policy_rollouts, similar_clips
-from rsjax.tools.policies.policy import Policy
+from rsjax.tools.policies.policy import Policy, check_fits
 from rsjax.tools.policies.studies.trials import FPS
 from rsjax.tools.policies.worlds.actions import check_takes_actions
 from rsjax.tools.policies.worlds.model_world import model_key
@@ -215,12 +215,7 @@ def policy_actor(name: str, policy: Policy, trained: TrainedModel) -> MakeActor:
     Raises:
         UserError: the policy's actions or frames differ in size from those of the run's clips.
     """
-    clips = trained.config.clips
-    if (policy.action_dim, policy.model.image_size) != (clips.action_dim, clips.image_size):
-        raise UserError(
-            f"{name}: it sees {policy.model.image_size} pixels and answers with {policy.action_dim} "
-            f"numbers; the run's clips have {clips.image_size} and {clips.action_dim}"
-        )
+    check_fits(policy, trained.config.clips, name)
 
     def make(seed: int, goal: np.ndarray) -> Actor:
         return policy.actor(seed)

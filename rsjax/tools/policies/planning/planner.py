@@ -62,6 +62,7 @@ class PlannerConfig:
         require_range(self, "planner", 1, 2**31, "horizon", "rounds", "hold")
         require_range(self, "planner", 2, 2**31, "candidates")
         require_range(self, "planner", 0, 0.999, "memory", "margin")
+        require_range(self, "planner", 0, 2**31, "seed")
         require_range(self, "planner", 1, self.candidates, "elites")
         for name in ("temperature", "spread"):
             require(getattr(self, name) > 0, f"planner.{name} is {getattr(self, name)}; it must be above 0")

@@ -124,14 +124,16 @@ def adapt(data: RunData, behaviour: Behaviour, settings: Adaptation, out: Path, 
     """
     scores_of(data.run)  # raises before anything is simulated if the run was not evaluated
     fixed = replace(settings, rounds=1)  # a second round may follow later
-    policies = str({name: policy.key for name, policy in behaviour.policies.items()})
-    together = behaviour.trials.together
-    if behaviour.simulator:
-        together = behaviour.simulator.count  # fewer if there are fewer trials; the episodes' draws depend on it
-    steps = str((behaviour.trials.max_steps, together))
+    policies = ""
+    steps = ""
     episodes = ""
-    if behaviour.episodes:
+    if behaviour.episodes:  # what policies do is measured alone
         episodes = str(open_store(behaviour.episodes).manifest.get("key"))
+    else:
+        assert behaviour.simulator is not None
+        policies = str({name: policy.key for name, policy in behaviour.policies.items()})
+        # The episodes' draws depend on the simulator's count, which is at most ``together``.
+        steps = str((behaviour.trials.max_steps, behaviour.simulator.count))
     key = content_key("adapt", str(fixed), model_key(data.trained), policies, steps, episodes)
     with make_once(out, key, refuse=OTHERS, again=True) as work:
         count = steps_of(data.run, settings, work)
@@ -172,10 +174,13 @@ def on_policy_clips(data: RunData, behaviour: Behaviour, settings: Adaptation, n
     frames = data.config.clips.frames
     if behaviour.episodes:
         made = cut(open_store(behaviour.episodes), data.clips, frames, place / "clips")
-        if not {"train", "test"} <= set(made.splits):
+        counts = made.counts()
+        train = counts.get("train", 0)
+        test = counts.get("test", 0)
+        if train < 1 or test < 2:
             raise UserError(
-                f"{behaviour.episodes}: has clips in {', '.join(made.splits)} alone; the model learns from train "
-                f"and is scored on test"
+                f"{behaviour.episodes}: gives {train} clips to train and {test} to test; the model learns from one at "
+                f"least, and is scored on two at least"
             )
         return made
     assert behaviour.simulator is not None

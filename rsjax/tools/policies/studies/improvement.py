@@ -31,6 +31,7 @@ from rsjax.tools.policies.worlds.model_world import FirstFrame
 from rsjax.tools.policies.worlds.world import World, run_episodes
 from rsjax.tools.studies.tables import Table, as_markdown
 
+OTHERS = "holds imagined episodes of other settings, policies, models or judges; choose another --out, or delete it"
 HEADINGS = (
     "round",
     "imagined",
@@ -90,14 +91,20 @@ def improve(
     Args:
         policy: the policy to begin with.
         demos: the demonstrations that the policy was trained on.
-        starts: first frames for imagined episodes; each round continues in this list where the last one ended.
+        starts: first frames for imagined episodes; each round continues in this list where the last one ended. Those of
+            demonstrations that are followed are left out.
         model: the world model.
         simulator: the true simulator, in which success is measured before and after each round.
         out: the folder for policies, imagined successes, ``results.json``, ``results.md`` and ``success.png``.
 
     Returns:
         The content of ``results.json``. An interrupted call resumes.
+
+    Raises:
+        UserError: ``out`` has results of other settings or inputs, or all starts are those of followed demonstrations.
     """
+    if settings.follow_demos:
+        starts = new_starts(starts, demos)
     rows: list[dict[str, Any]] = []
     arms = {"imagined": policy, "control": policy}
     config = policy.model.config  # changed once: the policies of later rounds have these settings already
@@ -140,6 +147,19 @@ def improve(
     return results
 
 
+def new_starts(starts: Sequence[FirstFrame], demos: Demos) -> list[FirstFrame]:
+    """Returns the starts that are no demonstration's first frame.
+
+    Raises:
+        UserError: there is none.
+    """
+    known = {record["rgb"][0].tobytes() for record in demos.records}
+    found = [start for start in starts if start.rgb.tobytes() not in known]
+    if not found:
+        raise UserError("all first frames are those of demonstrations; --follow-demos needs others: use fewer --demos")
+    return found
+
+
 def imagine(
     actors: Policy | SimilarClips,
     starts: Sequence[FirstFrame],
@@ -156,6 +176,9 @@ def imagine(
     Returns:
         The episodes that the judge calls successes, as demonstrations; and over all episodes, how many end in a frame
         that the judge calls uninterpretable, and how many numbers of actions were clipped.
+
+    Raises:
+        UserError: ``folder`` holds other episodes.
     """
     begins = (number - 1) * settings.imagined
     # A start that is used again gets different draws.
@@ -166,7 +189,7 @@ def imagine(
     uninterpretable = 0
     clipped = 0
     with (
-        make_once(folder, key, refuse=None),
+        make_once(folder, key, refuse=OTHERS),
         Progress(f"round {number}: imagining", len(chosen), "episodes") as progress,
     ):
         for first in range(0, len(chosen), model.count):

@@ -20,7 +20,7 @@ from rsjax.progress import Progress
 from rsjax.tools.policies.judges.judge import FAIL, SUCCESS, UNINTERPRETABLE, Judge
 from rsjax.tools.policies.judges.people_and_vlms import SHEET, HumanJudge, LanguageJudge, video_name, write_blinded
 from rsjax.tools.policies.judges.validation import scores, summary
-from rsjax.tools.policies.studies.policy_evaluation import FIRST_TRAINING, compared, write_results
+from rsjax.tools.policies.studies.policy_evaluation import compared, write_results
 from rsjax.tools.policies.studies.trials import TrialResult, Trials
 
 Rollouts = dict[str, list[UInt8[np.ndarray, "T S S 3"]]]  # by policy, one for each episode
@@ -86,12 +86,12 @@ def rejudge(out: Path, judge: Judge, name: str) -> Path:
                 (label == SUCCESS).tolist(),
                 row["policies"][policy]["clipped"]["world_model"],
                 (label == UNINTERPRETABLE).tolist(),
-                row["policies"][policy].get("unfamiliarity", []),
+                row["policies"][policy]["unfamiliarity"],
             )
             for policy, label in labels.items()
         }
-        training = {name: each.get("training", FIRST_TRAINING) for name, each in row["policies"].items()}
-        judged = {"like": row.get("like", row["run"]), "judge": summary({"raw": checked})}
+        training = {name: each["training"] for name, each in row["policies"].items()}
+        judged = {"like": row["like"], "judge": summary({"raw": checked})}
         again = {name: each["replayed"] for name, each in row["policies"].items()}
         rows.append(compared(row["run"], true, made, again, training) | judged)
     write_results(folder, rows, Trials(**results["trials"]))

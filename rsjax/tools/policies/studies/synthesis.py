@@ -64,6 +64,8 @@ class Synthesis:
             raise UserError(f"--fps {self.fps:g}: frames per second, 0.001 to 1000; 0: as the clips say")
         if self.demos < 1 or self.batch < 1 or not 0 <= self.noise < float("inf"):
             raise UserError(f"--demos {self.demos}, --batch {self.batch}, --noise {self.noise}: 1, 1 and 0 at least")
+        if self.seed < 0:
+            raise UserError(f"--seed {self.seed}: 0 at least")
 
 
 def synthesize(

@@ -14,7 +14,6 @@ from rsjax.artifact import make_once
 from rsjax.clip import GENERATED_MARK
 from rsjax.config import SimConfig, content_key
 from rsjax.errors import UserError
-from rsjax.evaluation.statistics import Estimate, wilson
 from rsjax.files import write_file
 from rsjax.processes import count_cores
 from rsjax.progress import Progress
@@ -75,11 +74,6 @@ class TrialResult:
     clipped: int = 0
     uninterpretable: list[bool] = field(default_factory=list)
     unfamiliarity: list[float] = field(default_factory=list)
-
-    @property
-    def share(self) -> Estimate:
-        """The share of successes with its Wilson interval."""
-        return wilson(sum(self.success), len(self.success))
 
 
 def try_policy(

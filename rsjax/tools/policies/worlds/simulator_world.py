@@ -1,7 +1,7 @@
 """Lift in the simulator as a world, so that a policy can act in what clips recorded.
 
 One step is one frame at the clips' rate. An action is like a clip's: ``control_steps`` controls of 7 numbers
-(docs/policies.md). Frames are rendered as in clips, so replaying a clip's actions from its start gives its frames.
+(docs/policies.md). Frames are rendered as in clips, so replaying an episode's actions from its start gives its frames.
 
 Axes: B episodes, S×S pixels, A = k·D action dimensions of k control steps.
 """

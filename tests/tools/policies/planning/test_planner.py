@@ -101,6 +101,9 @@ def test_held_controls_repeat_and_wrong_energies_are_named() -> None:
     assert seen[0].shape == (8, 12, 6)
     with pytest.raises(ConfigError, match="planner.hold is 4; it must divide the 6 numbers"):
         Planner(distance, -np.ones(6), np.ones(6), replace(config, hold=4))
+    with pytest.raises(ConfigError) as refused:
+        PlannerConfig(seed=-1)
+    assert "planner.seed is -1" in str(refused.value)
     with pytest.raises(ConfigError, match="planner.elites is 9"):
         replace(config, elites=9)
     for wrong in (np.zeros((8, 1)), np.full(8, np.nan), np.full(8, -np.inf)):

@@ -151,6 +151,10 @@ def test_a_call_on_the_episodes_that_is_killed_and_runs_again_gives_the_same_byt
     found = results(tmp_path)
     assert "success" not in found
     assert found["models"] == results(place.out)["models"]
+    command.here(
+        "experiments.adapt", *words, "--policy", place.policy, "--trials", 2, "--max-steps", 7, "--together", 1
+    )
+    assert results(tmp_path)["success"] == results(place.out)["success"]  # a policy is measured without a new training
     line = command.refused("experiments.adapt", *words, "--share", 0.4)
     assert "holds an adaptation of another run, to other policies or episodes, or with other settings" in line
 

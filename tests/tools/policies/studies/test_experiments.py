@@ -295,10 +295,11 @@ def test_imagined_successes_are_learnt_from(tmp_path: Path, learnt: dict[str, tu
     assert "| 2 | 10 | 4 | 0 % | imagined | 60 % |" in squeezed(tmp_path / "results.md")
     count = len(draws)
     assert improve(*inputs) == results and len(draws) == count  # nothing is imagined again
-    drawn: list[list[int]] = []
-    other = imagined(5, pace=0.5, draws=drawn)  # a model of other weights imagines anew
-    made, counts = improvement.imagine(inputs[0], starts, other, settings, 1, tmp_path / "round-1" / "episodes")
-    assert not made and counts == {"uninterpretable": 0, "clipped": 0} and len(drawn) == 2
+    other: Any = (*inputs[:3], imagined(5, pace=0.5), *inputs[4:])  # a model of other weights
+    with pytest.raises(UserError) as refused:
+        improve(*other)
+    assert "episodes: holds imagined episodes of other" in str(refused.value)
+    assert improve(*inputs) == results and len(draws) == count  # nothing was lost
 
 
 def test_imagined_episodes_may_follow_the_old_demonstrations(
@@ -307,11 +308,17 @@ def test_imagined_episodes_may_follow_the_old_demonstrations(
     settings = Improvement(rounds=1, imagined=10, max_steps=4, steps=7, share=0, follow_demos=True)
     starts = first_frames(simulated(5), list(range(10)), tmp_path / "starts.npz")
     still: Any = ToyPolicy(0)
-    results = improve(still, demos(5), starts, imagined(5), simulated(5), settings, TRIALS, tmp_path)
-    assert results["settings"]["follow_demos"] and results["rounds"][0]["kept"] == 6  # from columns 2, 3 and 4, twice
-    first = learnt["round 1 imagined"][0][0]
-    np.testing.assert_array_equal(first["rgb"], demos(5)[0]["rgb"][1:6])  # it begins as the second frame of this one
-    np.testing.assert_array_equal(first["actions"][1:], demos(5)[0]["actions"][2:6])
+    inputs: Any = (starts, imagined(5), simulated(5), settings, TRIALS, tmp_path)
+    results = improve(still, demos(2), *inputs)
+    assert results["settings"]["follow_demos"] and results["rounds"][0]["kept"] == 10  # none begins in column 0 or 1
+    made = learnt["round 1 imagined"][0]
+    first = next(record for record in made.records if len(record["rgb"]) == 5)  # it begins in column 2 or 3
+    column = int(first["rgb"][0, 7, :, 0].argmax())
+    np.testing.assert_array_equal(first["rgb"], demos(2)[column - 2]["rgb"][1:6])
+    np.testing.assert_array_equal(first["actions"][1:], demos(2)[column - 2]["actions"][2:6])
+    with pytest.raises(UserError) as refused:
+        improve(still, demos(5), *inputs)
+    assert "all first frames are those of demonstrations" in str(refused.value)
 
 
 def test_old_demonstrations_are_the_share_that_is_asked_for() -> None:

@@ -170,7 +170,6 @@ def test_trials_that_are_interrupted_go_on(tmp_path: Path) -> None:
     result = try_policy(policy, simulated(2), starts, trials, tmp_path, "toy")
     assert policy.begun == [2, 4]  # the group that was cut short is run again, the first one is not
     assert result.success == [False, True, False, True, True]
-    assert result.share.value == 0.6 and result.share.low is not None and result.share.low < 0.6
     assert [path.name for path in tmp_path.glob("*.mp4")] == ["episode-00.mp4"]
     with pytest.raises(UserError, match="holds trials of other episodes or steps"):
         try_policy(ToyPolicy(1.0), simulated(2), starts, Trials(5, 9, 2), tmp_path, "toy")  # type: ignore[arg-type]
