@@ -27,7 +27,7 @@ from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.departures import mean_codes
 from rsjax.models.roboscape.departures.keep_still import keep_still
 from rsjax.models.roboscape.departures.second_view import views
-from rsjax.models.roboscape.sample import State, resting_actions, start, step, with_few_launches
+from rsjax.models.roboscape.sample import State, compiled_start, resting_actions, step, with_few_launches
 from rsjax.models.roboscape.transformer import Cache
 from rsjax.tokenizers.codec import Codec
 from rsjax.tokenizers.magvit2 import for_many_pictures, run_tokenizer
@@ -179,7 +179,9 @@ class TokenBranching:
         hidden = jnp.ones(1, bool) if self._arch.depth != "none" and not self._has_depth else None
         actions = jnp.zeros((1, 1, self._arch.action_inputs))
         resting = resting_actions(self._arch, self._codec.normalization)
-        state: State = self._place(_start(self._arch, sample, self._params, tokens, actions, None, hidden, resting))
+        state: State = self._place(
+            compiled_start(self._arch, sample, self._params, tokens, actions, None, hidden, resting)
+        )
         return state
 
     def _branch_state(self, memory: _Memory, rgb: UInt8[np.ndarray, "H W 3"]) -> BranchState:
@@ -216,9 +218,6 @@ def program_clips(lanes: int) -> int:
     if on_cpu():
         return 1
     return lanes
-
-
-_start = jax.jit(start, static_argnums=(0, 1))
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2), donate_argnums=(5,))

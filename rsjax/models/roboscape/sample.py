@@ -513,7 +513,7 @@ def encode_prompt(
     """
     arch.check_sampling(sample)
     tokens, no_depth = _prompt_tokens(arch, prompt, no_depth)
-    state = _start(arch, sample.compiled, params, tokens, actions, None, no_depth, resting)
+    state = compiled_start(arch, sample.compiled, params, tokens, actions, None, no_depth, resting)
     return Prompt(tokens, state, _cache_settings(arch, sample))
 
 
@@ -600,7 +600,7 @@ def _padded(arch: Architecture, actions: Float[Array, "B T A"], frames: int) -> 
     return jnp.pad(actions, ((0, 0), (0, -frames % arch.frames), (0, 0)))
 
 
-_start = jax.jit(start, static_argnums=(0, 1))
+compiled_start = jax.jit(start, static_argnums=(0, 1))
 
 
 @partial(jax.jit, static_argnums=(0, 1))

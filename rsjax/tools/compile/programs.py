@@ -85,7 +85,7 @@ def train(config: Config, devices: Sequence[Any]) -> Program:
     with inputs.random_files(config) as readable:
         one = inputs.batch_shapes(create_model(readable), readable)
     flops = loop.batch_size * model.flops(config.clips.frames).get("train", 0)
-    return _training("training step", "clips", model, loop, devices, one, flops)
+    return _training("training step", model, loop, devices, one, flops)
 
 
 def train_tokenizer(config: Config, devices: Sequence[Any]) -> Program:
@@ -100,15 +100,16 @@ def train_tokenizer(config: Config, devices: Sequence[Any]) -> Program:
         "depth": None,
         "actions": np.zeros((config.clips.frames, config.clips.action_dim), np.float32),
     }
+    if config.second_view:
+        record["second"] = record["rgb"]
     arrays = {name: x[None] for name, x in model.transform()(record, rng).items()}
     one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), model.batch(arrays))
     flops = 3 * loop.batch_size * frames * sum(model.flops().values())
-    return _training("tokenizer's training step", "clips", model, loop, devices, one, flops)
+    return _training("tokenizer's training step", model, loop, devices, one, flops)
 
 
 def _training(
     title: str,
-    unit: str,
     model: Trainable[Any],
     loop: LoopConfig,
     devices: Sequence[Any],
@@ -138,8 +139,8 @@ def _training(
     compiled: Any = sharding.compile(train_step, model, loop)
     each = (np.prod(x.sharding.shard_shape(x.shape)) * x.dtype.itemsize for x in jax.tree.leaves(state))
     return Program(
-        title=f"{title} on {loop.batch_size} {unit}",
-        unit=unit,
+        title=f"{title} on {loop.batch_size} clips",
+        unit="clips",
         count=loop.batch_size,
         devices=used,
         model_flops=flops,

@@ -73,7 +73,7 @@ def too_large(numbers: dict[str, Any], config: Config, part: Part, target: Targe
         return (
             f"{line}; the largest batch that fits is {batch}: --{SECTIONS[part].replace('_', '-')}.batch-size {batch}"
         )
-    excess = numbers["memory_bytes"] - capacity(target)
+    excess = numbers.get("smallest_batch_bytes", numbers["memory_bytes"]) - capacity(target)
     return f"{line}; {_split_state(config, target, numbers['state_bytes'], excess)}"
 
 
@@ -113,9 +113,13 @@ def _largest(
         second = programs(_with_batch(config, part, other), part, devices, 1)[0]
         needed = {program.count: compiled.needed, other: compile_program(second, target, console).needed}
     except TooLargeError:
-        return {"largest_batch": program.count, "largest_batch_from": f"{other} does not"}
+        fits = compiled.needed <= capacity(target)
+        return {"largest_batch": program.count * fits, "largest_batch_from": f"{other} does not"}
+    small, large = sorted(needed)
+    per_clip = (needed[large] - needed[small]) / (large - small)
     return {
         "largest_batch": largest_batch(needed, capacity(target), step),
+        "smallest_batch_bytes": needed[small] - per_clip * (small - step),
         "largest_batch_from": f"extrapolated from the memory of {min(needed)} and {max(needed)}, both compiled",
     }
 

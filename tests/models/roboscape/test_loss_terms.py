@@ -70,6 +70,12 @@ def test_what_is_off_or_has_a_weight_of_0_has_no_term(depth: Any, settings: dict
     assert terms.keys() == model_of(model, loss).loss_weights.keys() == {"rgb"} | names
 
 
+def test_points_that_the_first_frame_hides_never_count() -> None:
+    visible = np.array([[[True, False, True], [False, True, True]]])
+    for departures, rows in ((Departures(), [True] * 3), (Departures(visible_keypoints=True), [True, False, True])):
+        np.testing.assert_array_equal(counted_frames(departures, visible), [[rows, [False] * 3]])
+
+
 corrupt = jax.jit(partial(masking.corrupt, CORRUPTION, 0.0, 1, MODEL.code_bits, MODEL.vocabularies))
 
 

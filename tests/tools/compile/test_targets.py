@@ -3,12 +3,15 @@
 from importlib.util import find_spec
 from pathlib import Path
 
+import jax
 import pytest
 
-from rsjax.config import ConfigError
+from rsjax.config import ConfigError, presets
+from rsjax.config.config_fields import with_values
 from rsjax.errors import UserError
 from rsjax.tools.commands.compile import enter_environment
 from rsjax.tools.compile.cards import CARDS
+from rsjax.tools.compile.programs import train_tokenizer
 from rsjax.tools.compile.report import largest_batch
 from rsjax.tools.compile.targets import find
 
@@ -57,6 +60,12 @@ def test_the_largest_batch_lies_on_the_line_through_two() -> None:
     assert largest_batch({8: 18, 16: 34}, room=82, step=1) == 40
     assert largest_batch({8: 18, 16: 34}, room=82, step=16) == 32
     assert largest_batch({8: 18, 16: 34}, room=3, step=1) == 0
+
+
+def test_a_tokenizer_of_two_views_has_a_program() -> None:
+    config = with_values(presets.debug(), {"sim.second_view": "wrist"})
+    program = train_tokenizer(config, jax.devices()[:1])
+    assert program.title == f"tokenizer's training step on {config.tokenizer_train.batch_size} clips"
 
 
 def test_without_compilers_the_command_names_what_installs_them(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ def counted_frames(departures: Departures, visible: Bool[Array, "B N T"]) -> Boo
 
     A point that is not visible in the first frame was not sampled (a clip without tracks has none) and never counts.
     """
+    sampled = visible[..., :1]
     if departures.visible_keypoints:
-        return visible
-    return jnp.broadcast_to(visible[..., :1], visible.shape)
+        return visible & sampled
+    return jnp.broadcast_to(sampled, visible.shape)

@@ -18,8 +18,8 @@ LEGEND = (
     "own clips). p is the test's, adjusted by Holm's method for the comparisons of the claim. A comparison holds, "
     "or does not hold, if the interval and p < 0.05 agree. It is equal within the margin that it names if the 90 % "
     "interval lies within it and both one-sided tests, adjusted likewise, have p < 0.05. Otherwise it cannot be "
-    "told. A claim holds if all its comparisons do; it does not hold if any does not, or if sides are equal and "
-    "nothing is open. With one seed there is no verdict."
+    "told. A claim holds if all its comparisons that were measured do; it does not hold if any does not, or if "
+    "sides are equal and nothing is open. With one seed there is no verdict."
 )
 EQUAL = {
     "steps": "equal steps of the world model",
