@@ -17,7 +17,9 @@ def tokenizer_key(config: Any, weights: str, *shifts: int) -> str:
         weights: fingerprint of the tokenizer's weights.
         shifts: how many shifted copies of a clip there are and how far they are shifted, if there are any.
     """
-    settings = config.depth_scale if isinstance(config, TokenizerConfig) else config
+    settings = config
+    if isinstance(config, TokenizerConfig):
+        settings = (config.depth_scale, config.compute_dtype)
     return content_key("tokenizer", weights, settings, *shifts)
 
 

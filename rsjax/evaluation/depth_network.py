@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
-import cv2
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -21,7 +20,7 @@ from jaxtyping import Array, Float, Float32, UInt8
 from rsjax.data.clips import spread
 from rsjax.data.codec import Record
 from rsjax.evaluation.depth_estimator import DepthMaps
-from rsjax.layers.group_norm import GroupNorm
+from rsjax.evaluation.localiser import blur, enlarged, layer
 from rsjax.progress import Progress
 from rsjax.trainable import Params
 
@@ -51,24 +50,15 @@ class DepthUNet(nn.Module):
         x = jnp.concatenate([pixels, place], -1)
         levels = []
         for width in WIDTHS:
-            x = _layer(nn.Conv(width, (4, 4), (2, 2))(x))
-            x = _layer(nn.Conv(width, (3, 3))(x))
+            x = layer(nn.Conv(width, (4, 4), (2, 2))(x))
+            x = layer(nn.Conv(width, (3, 3))(x))
             levels.append(x)
         for finer in levels[-2::-1]:
-            x = finer + _enlarged(nn.Conv(finer.shape[-1], (1, 1))(x), finer)
-            x = _layer(nn.Conv(finer.shape[-1], (3, 3))(x))
-        x = nn.Conv(8, (3, 3))(pixels) + _enlarged(nn.Conv(8, (1, 1))(x), pixels)
+            x = finer + enlarged(nn.Conv(finer.shape[-1], (1, 1))(x), finer)
+            x = layer(nn.Conv(finer.shape[-1], (3, 3))(x))
+        x = nn.Conv(8, (3, 3))(pixels) + enlarged(nn.Conv(8, (1, 1))(x), pixels)
         start = nn.initializers.constant(self.first)
         return nn.Conv(1, (3, 3), kernel_init=nn.initializers.zeros, bias_init=start)(nn.relu(x))[..., 0]
-
-
-def _layer(x: Array) -> Array:
-    return nn.relu(GroupNorm(8)(x))
-
-
-def _enlarged(x: Array, like: Array) -> Array:
-    """Repeats each cell 2×2 times, up to the size of ``like``."""
-    return x.repeat(2, axis=1).repeat(2, axis=2)[:, : like.shape[1], : like.shape[2]]
 
 
 @dataclass(frozen=True)
@@ -131,8 +121,7 @@ def varied(rng: np.random.Generator, frames: UInt8[np.ndarray, "B H W 3"]) -> Fl
     """Blurs each frame by a random amount, and scales and shifts its colours."""
     images = frames.astype(np.float32)
     for image, shares in zip(images, rng.random((len(frames), 2)), strict=True):
-        for share in shares:
-            image += share * (cv2.GaussianBlur(image, (5, 5), 0, borderType=cv2.BORDER_REPLICATE) - image)
+        blur(image, shares)
     factors = rng.normal(1, COLOUR, (len(frames), 1, 1, 3))
     shifts = 255 * rng.normal(0, COLOUR / 2, (len(frames), 1, 1, 3))
     return np.clip(factors * images + shifts, 0, 255).astype(np.float32)

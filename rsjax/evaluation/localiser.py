@@ -53,32 +53,33 @@ class LocaliserNetwork(nn.Module):
     @nn.compact
     def __call__(self, rgb: Array) -> tuple[Float[Array, "B 2 2"], Float[Array, " B"], Float[Array, "B n 2"]]:
         """Returns places, the logit of "lifted", and the softmax's log-probabilities of the n cells of 2×2 pixels."""
-        fine = _layer(nn.Conv(16, (4, 4), (2, 2))(rgb.astype(jnp.float32) / 127.5 - 1))
-        fine = _layer(nn.Conv(16, (3, 3))(fine))
-        middle = _layer(nn.Conv(32, (3, 3), (2, 2))(fine))
-        middle = _layer(nn.Conv(32, (3, 3))(middle))
-        coarse = _layer(nn.Conv(64, (3, 3), (2, 2))(middle))
-        coarse = _layer(nn.Conv(64, (3, 3))(coarse))
-        middle = _layer(nn.Conv(32, (3, 3))(middle) + _enlarged(nn.Conv(32, (1, 1))(coarse), middle))
-        fine = _layer(nn.Conv(16, (3, 3))(fine) + _enlarged(nn.Conv(16, (1, 1))(middle), fine))
-        fine = _layer(nn.Conv(16, (3, 3))(fine))
+        fine = layer(nn.Conv(16, (4, 4), (2, 2))(rgb.astype(jnp.float32) / 127.5 - 1))
+        fine = layer(nn.Conv(16, (3, 3))(fine))
+        middle = layer(nn.Conv(32, (3, 3), (2, 2))(fine))
+        middle = layer(nn.Conv(32, (3, 3))(middle))
+        coarse = layer(nn.Conv(64, (3, 3), (2, 2))(middle))
+        coarse = layer(nn.Conv(64, (3, 3))(coarse))
+        middle = layer(nn.Conv(32, (3, 3))(middle) + enlarged(nn.Conv(32, (1, 1))(coarse), middle))
+        fine = layer(nn.Conv(16, (3, 3))(fine) + enlarged(nn.Conv(16, (1, 1))(middle), fine))
+        fine = layer(nn.Conv(16, (3, 3))(fine))
 
         b, h, w, _ = fine.shape
         log_p = jax.nn.log_softmax(nn.Conv(len(OBJECTS), (1, 1))(fine).reshape(b, h * w, -1), axis=1)
         corrections = nn.Conv(2 * len(OBJECTS), (1, 1), kernel_init=nn.initializers.zeros)(fine)
         at = _centres(h, w)[:, None] + 0.05 * corrections.reshape(b, h * w, -1, 2)
         xy = jnp.einsum("bno,bnoc->boc", jnp.exp(log_p), at)
-        features = jnp.concatenate([fine, _enlarged(middle, fine)], -1).reshape(b, h * w, -1)
+        features = jnp.concatenate([fine, enlarged(middle, fine)], -1).reshape(b, h * w, -1)
         around = jnp.einsum("bno,bnc->boc", jnp.exp(log_p), features)  # features at the objects
         at_objects = jnp.concatenate([around.reshape(b, -1), xy.reshape(b, -1)], -1)
         return xy, nn.Dense(1)(nn.relu(nn.Dense(32)(at_objects)))[:, 0], log_p
 
 
-def _layer(x: Array) -> Array:
+def layer(x: Array) -> Array:
+    """Normalises and rectifies features."""
     return nn.relu(GroupNorm(8)(x))
 
 
-def _enlarged(x: Array, like: Array) -> Array:
+def enlarged(x: Array, like: Array) -> Array:
     """Repeats each cell 2×2 times, up to the size of ``like``."""
     return x.repeat(2, axis=1).repeat(2, axis=2)[:, : like.shape[1], : like.shape[2]]
 
@@ -158,9 +159,14 @@ def varied(
     images = np.empty(frames.shape, np.float32)
     for image, frame, move, shares in zip(images, frames, moves, rng.random((len(frames), 2)), strict=True):
         image[:] = moved(frame[None], *move)[0]
-        for share in shares:
-            image += share * (cv2.GaussianBlur(image, (5, 5), 0, borderType=cv2.BORDER_REPLICATE) - image)
+        blur(image, shares)
     return images, np.clip(xy + moves[:, None] / size, 0, 1)
+
+
+def blur(image: Float32[np.ndarray, "H W 3"], shares: Float[np.ndarray, " N"]) -> None:
+    """Blurs an image in place, by each share in turn, from 0 to 1."""
+    for share in shares:
+        image += share * (cv2.GaussianBlur(image, (5, 5), 0, borderType=cv2.BORDER_REPLICATE) - image)
 
 
 @jax.jit

@@ -31,7 +31,7 @@ class Profile:
     @classmethod
     def after(cls, directory: Path, start: int, last: int, count: int) -> "Profile":
         """Returns a profile of ``count`` steps of a run from ``start`` + 1 to ``last``, after the first few."""
-        return cls(directory, start + 1 + max(0, min(SKIPPED, last - start - count)), count)
+        return cls(directory, start + 1 + max(0, min(SKIPPED, last - start - count)), min(count, last - start))
 
     def at(self, step: int, pending: PyTree = None) -> None:
         """Starts or ends the trace when it is time. Call it before each step.

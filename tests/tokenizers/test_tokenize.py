@@ -10,7 +10,7 @@ import pytest
 from rsjax.data.normalization import Normalization
 from rsjax.data.quarantine import read_quarantine
 from rsjax.data.shift import moved
-from rsjax.data.store import Store, StoreError
+from rsjax.data.store import Store, StoreError, encode_clip, open_store, write_store
 from rsjax.tokenizers.tokenize import fingerprint, tokenize_store
 from rsjax.tools.commands import store as command
 from rsjax.tools.pipeline.run import Run
@@ -28,6 +28,19 @@ def test_a_damaged_test_clip_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match="number 2 of the split"):
         tokenized(clips, tmp_path)
     assert not (tmp_path / "quarantine.jsonl").exists()
+
+
+def test_a_damaged_validation_clip_is_listed(tmp_path: Path) -> None:
+    meta = toy.store(tmp_path / "toy").manifest
+    splits = {
+        split: [encode_clip(toy.clip(number)) for number in range(3)] for split in ("train", "validation", "test")
+    }
+    write_store(tmp_path / "clips", "clips", splits, meta)
+    clips = open_store(tmp_path / "clips")
+    damage(clips, "validation", 1)
+    assert len(tokenized(clips, tmp_path).source("validation")) == 2
+    (row,) = read_quarantine(tmp_path / "quarantine.jsonl")
+    assert (row["split"], row["record"]) == ("validation", 1)
 
 
 def test_every_run_lists_the_clips_that_lack_tokens_until_they_are_mended(tmp_path: Path) -> None:

@@ -64,6 +64,13 @@ def test_count_steps_are_traced_after_the_first_ones(
     assert recorder.starts == bool(traced)
 
 
+def test_a_training_without_steps_has_no_trace(recorder: Recorder, tmp_path: Path) -> None:
+    profile = Profile.after(tmp_path, 20, 20, 3)
+    with profile:
+        profile.at(21)
+    assert recorder.starts == 0
+
+
 def test_an_error_passes_and_ends_the_trace(recorder: Recorder, tmp_path: Path) -> None:
     with pytest.raises(RuntimeError, match="boom"):
         recorder.run(Profile(tmp_path, 2, 5), 1, 9, fails_at=4)

@@ -12,7 +12,7 @@ from itertools import pairwise
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float, Float32, UInt8
 
 from rsjax.evaluation.metrics.psnr_motion import moved
 from rsjax.evaluation.registry import PerClip, PerFrame, Scene, metric
@@ -32,15 +32,23 @@ Points = Float32[np.ndarray, "K 2"]
 def ghost_frames(scene: Scene) -> PerFrame:
     """Returns the share of mixed pixels of every predicted frame, among those with another colour than at first."""
     last = scene.prompt_frames - 1
-    start = scene.truth.rgb[:, last : last + 1].astype(np.float32)
-    way = scene.truth.rgb[:, last + 1 :] - start
-    gone = scene.prediction.rgb[:, last + 1 :] - start
+    clips = zip(scene.truth.rgb[:, last:], scene.prediction.rgb[:, last:], strict=True)
+    return np.stack([mixed_share(truth, prediction) for truth, prediction in clips])  # all at once take gigabytes
+
+
+def mixed_share(
+    truth: UInt8[np.ndarray, "T H W 3"], prediction: UInt8[np.ndarray, "T H W 3"]
+) -> Float[np.ndarray, " T-1"]:
+    """Returns the share of mixed pixels of a clip's frames after the first one."""
+    start = truth[:1].astype(np.float32)
+    way = truth[1:] - start
+    gone = prediction[1:] - start
     length = np.square(way).sum(-1)
     visible = length >= CONTRAST**2
     share = (gone * way).sum(-1) / np.where(visible, length, 1)
     aside = np.square(gone - share[..., None] * way).sum(-1)
     mixed = visible & (share > MIXED[0]) & (share < MIXED[1]) & (aside < ASIDE**2 * length)
-    return mixed.sum((2, 3)) / np.maximum(visible.sum((2, 3)), 1)
+    return mixed.sum((1, 2)) / np.maximum(visible.sum((1, 2)), 1)
 
 
 @metric("ghost", "ghosts", better="lower", decimals=3, column=False, per_frame=ghost_frames)

@@ -116,10 +116,9 @@ def probes_of(run: Run, store: Store, eval_clips: EvaluationClips) -> Probes | U
         return Unavailable(f"grasps and drives are scored with the split test, not with {eval_clips.split}")
     if protocol.teacher_forced:
         return Unavailable(f"protocol {protocol.name} gives the true frames before each predicted one")
-    if protocol.clips < LEAST_CLIPS:
-        return Unavailable(
-            f"{protocol.clips} clips are scored; grasps and drives are simulated where {LEAST_CLIPS} or more are"
-        )
+    if len(eval_clips.records) < LEAST_CLIPS:
+        count = len(eval_clips.records)
+        return Unavailable(f"{count} clips are scored; grasps and drives are simulated where {LEAST_CLIPS} or more are")
     config = from_dict(SimConfig, store.manifest["config"])
     with Progress("simulating grasps and drives", 0, "episodes") as progress:
         try:

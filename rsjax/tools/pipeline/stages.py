@@ -205,7 +205,11 @@ def train_world_model(run: Run, resume: bool) -> None:
             f"its model has to know the tokens of this run's tokenizer"
         )
     model = create_model(cfg)
+    on_lead("estimated annotations", with_estimates, run, cfg.loop("world_model"))  # found by all in the next line
     loader = world_model_loader(run)
+    per_step = ("frames", train.batch_size * cfg.clips.frames)
+    if any(part.frames for part in train.curriculum):
+        per_step = ("clips", train.batch_size)
     if is_lead():
         for line in loader.summary():
             note(line)
@@ -218,7 +222,7 @@ def train_world_model(run: Run, resume: bool) -> None:
         start=pretrained_start(model, train.start_from, "world_model"),
         resume=resume,
         validate=WorldModelValidation(run),
-        per_step=("frames", train.batch_size * cfg.clips.frames),
+        per_step=per_step,
     )
     if is_lead():
         save_weights(run.output("world_model"), state.weights)

@@ -71,7 +71,7 @@ def test_what_is_off_or_has_a_weight_of_0_has_no_term(depth: Any, settings: dict
 
 
 def test_points_that_the_first_frame_hides_never_count() -> None:
-    visible = np.array([[[True, False, True], [False, True, True]]])
+    visible = jnp.array([[[True, False, True], [False, True, True]]])
     for departures, rows in ((Departures(), [True] * 3), (Departures(visible_keypoints=True), [True, False, True])):
         np.testing.assert_array_equal(counted_frames(departures, visible), [[rows, [False] * 3]])
 

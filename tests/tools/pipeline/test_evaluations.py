@@ -370,7 +370,7 @@ IN_LIFT_ALONE = "grasps and drives are simulated in Lift alone; the clips are of
         ("metaworld/Sawyer", "test", {}, f"{IN_LIFT_ALONE} metaworld/Sawyer"),
         (LIFT, "train", {}, "grasps and drives are scored with the split test, not with train"),
         (LIFT, "test", {"teacher_forced": True}, "protocol paper gives the true frames before each predicted one"),
-        (LIFT, "test", {}, "5 clips are scored; grasps and drives are simulated where 48 or more are"),
+        (LIFT, "test", {}, f"{toy.TEST} clips are scored; grasps and drives are simulated where 48 or more are"),
     ],
 )
 def test_an_evaluation_without_grasps_and_drives_says_why(
@@ -378,7 +378,7 @@ def test_an_evaluation_without_grasps_and_drives_says_why(
 ) -> None:
     store = run.open_clips()
     store = replace(store, manifest=store.manifest | {"source": source})
-    protocol = replace(find("paper", run.config), horizon=FRAMES - 1, clips=5, **changes)
+    protocol = replace(find("paper", run.config), horizon=FRAMES - 1, clips=100, **changes)
     chosen = EvaluationClips.read(store, "test", protocol, run.config.clips)
     found = probes_of(run, store, replace(chosen, split=split))
     assert isinstance(found, Unavailable)
