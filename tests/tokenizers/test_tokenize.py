@@ -35,7 +35,8 @@ def test_a_damaged_validation_clip_is_listed(tmp_path: Path) -> None:
     splits = {
         split: [encode_clip(toy.clip(number)) for number in range(3)] for split in ("train", "validation", "test")
     }
-    write_store(tmp_path / "clips", "clips", splits, meta)
+    names = ("key", "depth_range", "action_mean", "action_std")
+    write_store(tmp_path / "clips", "clips", splits, {name: meta[name] for name in names})
     clips = open_store(tmp_path / "clips")
     damage(clips, "validation", 1)
     assert len(tokenized(clips, tmp_path).source("validation")) == 2
