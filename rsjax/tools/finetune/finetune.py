@@ -3,15 +3,16 @@
 from dataclasses import asdict
 from pathlib import Path
 
-from rsjax.artifact import make_once
+from rsjax.artifact import make_once, read_mark
 from rsjax.config import Config, content_key
 from rsjax.data.store import Store, open_store
+from rsjax.errors import UserError
 from rsjax.progress import Progress, note
 from rsjax.tools.finetune.cost import estimate
 from rsjax.tools.finetune.recipe import FIXED_CAMERA, MARGIN, Finetuning, finetuned, measure_tokenizer, moving_share
 from rsjax.tools.finetune.recordings import Cutting, Recordings, ingest_options
 from rsjax.tools.finetune.start import StartingModel, content_of, write_start
-from rsjax.tools.ingest.ingest import count_steps, ingest, list_episodes
+from rsjax.tools.ingest.ingest import count_steps, ingest, is_up_to_date, list_episodes
 from rsjax.tools.ingest.options import make_plan, make_runner
 from rsjax.tools.ingest.summary import lines
 from rsjax.tools.pipeline.run import TRAINED, Run
@@ -27,13 +28,15 @@ def make_clips(recordings: Recordings, cutting: Cutting, source: StartingModel, 
     """Returns the store of clips: the one that was named, or one that is ingested into ``out`` unless it is there.
 
     Raises:
-        UserError: the recordings cannot be ingested.
+        UserError: the recordings cannot be ingested, or ``out`` holds a run on other clips.
     """
     if not recordings.source:
         return open_store(recordings.path)
     options = ingest_options(recordings, cutting, source.image_size, source.architecture.frames, out / CLIPS)
     plan = make_plan(recordings.source, recordings.path, options)
     listed = list_episodes(plan)
+    if read_mark(out / START) is not None and not is_up_to_date(plan, listed[0]):
+        raise UserError(f"{out / START}: {OTHERS}")  # before these clips replace those of the run
     with Progress("ingest", count_steps(plan, listed[0]), "steps", settle=2 * len(plan.steps)) as progress:
         summary = ingest(plan, make_runner(options), lambda done, total: progress.update(done), listed)
     if summary is not None:

@@ -80,6 +80,8 @@ def find_source(name: Path | str) -> StartingModel:
             f"{directory}: a model of family {config.model.family!r}; rsjax finetune takes roboscape and genie, and "
             f"rsjax train --train.start-from the others"
         )
+    if config.second_view:
+        raise UserError(f"{directory}: its model reads a second view (sim.second_view), which recordings do not have")
     return StartingModel(directory, config, read_architecture(directory))
 
 

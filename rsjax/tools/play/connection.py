@@ -50,6 +50,7 @@ class Connection:
         self._queue = SendQueue()
         self._todo: asyncio.Queue[dict[str, Any] | bytes] = asyncio.Queue(QUEUE)
         self._steps = 0
+        self._uploads = 0
         self._strikes = 0
         self._over: asyncio.Future[tuple[int, str]] = asyncio.get_running_loop().create_future()
 
@@ -110,7 +111,10 @@ class Connection:
         if raw.get("bytes") is not None:
             if len(raw["bytes"]) > UPLOAD_BYTES:
                 raise Refused("too_large", f"a picture can have {UPLOAD_BYTES // 2**20} MiB")
+            if self._uploads:
+                raise Refused("busy", "a picture waits already")
             self._wait(raw["bytes"])
+            self._uploads += 1
             return
         message = parse(raw["text"])
         if message["type"] == "step":
@@ -139,7 +143,9 @@ class Connection:
                 else:
                     number = error_id(json.dumps(item))
                 made = refusal(number, Refused("failed", "something went wrong; the server's terminal says what"))
-            if isinstance(item, dict) and item["type"] == "step":
+            if isinstance(item, bytes):
+                self._uploads -= 1
+            elif item["type"] == "step":
                 self._steps -= 1
             self._strikes += made.get("error") == "bad_message"
             self._queue.put(made)

@@ -161,7 +161,8 @@ def _clip(session: Session, branch: Branch, first: int, length: int) -> dict[str
         "episode": f"{session.name}-{branch.number}-{first}",
         "fps": run.fps,
     }
-    if session.has_depth:
+    metric = (manifest.get("depth_unit") or "metres") == "metres"  # stores of generated clips have no other unit
+    if session.has_depth and metric:
         made["depth"] = np.maximum(np.stack([_depth(session, node) for node in nodes]), 1e-3)
     made["provenance"] = {
         "source": GENERATED,

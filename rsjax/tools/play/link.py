@@ -20,7 +20,7 @@ from rsjax.tools.play.session import MOST_BRANCHES, MOST_SEED, SampleSettings, S
 
 VERSION = 1
 MOST_TEXT = TEXT_BYTES - 1024  # characters, because a link must fit into one message
-MOST_JSON = 32 * 2**20  # bytes, unpacked
+MOST_JSON = 4 * 2**20  # bytes, unpacked; a session of the most frames has less
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from rsjax.tools.policies.judges.head_judge import HeadJudge, check_heads, head_
 from rsjax.tools.policies.judges.judge import Judge
 from rsjax.tools.policies.judges.judge_training import FOLDER
 from rsjax.tools.policies.judges.trained_judge import load_judge
-from rsjax.tools.policies.worlds.actions import check_takes_actions
+from rsjax.tools.policies.worlds.actions import check_world_model
 from rsjax.tools.policies.worlds.model_world import FirstFrame, ModelWorld
 from rsjax.tools.sim.episode import begins_episode
 
@@ -88,7 +88,7 @@ class RunData:
             UserError: the run is unfinished, its model takes no actions or reads a second view, or there is no judge
                 for its frames.
         """
-        self._check_model()
+        check_world_model(self.config, f"{self.run}: the model")
         coverage = None
         if measured:
             coverage = make_coverage(self.trained, self.clips, self.run)
@@ -120,7 +120,7 @@ class RunData:
             UserError: the run is unfinished, its model takes no actions, reads a second view or lacks the judge's
                 heads, or frames or actions differ in size.
         """
-        self._check_model()
+        check_world_model(self.config, f"{self.run}: the model")
         if judge == Path(HEAD):
             check_heads(self.config.model, str(self.run))
         shapes = [(clips.image_size, clips.action_dim) for clips in (self.config.clips, like.config.clips)]
@@ -131,14 +131,6 @@ class RunData:
             )
         if not has_weights(self.run, "world_model"):
             raise UserError(f"{self.run}: its world model is not trained yet; the train command of this run goes on")
-
-    def _check_model(self) -> None:
-        check_takes_actions(self.config.model, f"{self.run}: the model")
-        if self.config.second_view:
-            raise UserError(
-                f"{self.run}: its model reads a second view (sim.second_view), which episodes of policies do not have; "
-                f"take a run without it"
-            )
 
     def judge(self, folder: Path | None = None) -> Judge:
         """Returns the run's judge, or the one in another folder.

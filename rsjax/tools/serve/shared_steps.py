@@ -44,10 +44,13 @@ class SharedSteps:
         return self._frame(self._state)
 
     def _frame(self, state: BranchState) -> Video:
-        """Returns a frame with its depth, (1, 1, S, S, …)."""
+        """Returns a frame with its depth, (1, 1, S, S, …), and what the state heads read."""
         rgb = state.rgb[None, None]
+        read = None
+        if state.state is not None:
+            read = state.state[None, None]
         if not self._has_depth:
-            return Video(rgb)
+            return Video(rgb, state=read)
         depth = self._engine.branching(True).depth(state)
         assert depth is not None
-        return Video(rgb, depth[None, None])
+        return Video(rgb, depth[None, None], state=read)

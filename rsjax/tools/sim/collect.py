@@ -22,7 +22,7 @@ from rsjax.files import disk_guard, write_atomically
 from rsjax.processes import WorkerDied, count_cores, run_items
 from rsjax.tools.sim import metaworld
 from rsjax.tools.sim.episode import ENVIRONMENTS, EpisodePlan, Simulators, run_episode, source_name, task_of
-from rsjax.tools.sim.gl import GLError, choose_gl, share_cores
+from rsjax.tools.sim.gl import choose_gl, share_cores
 from rsjax.tools.sim.recipes.plans import training_plans, versions
 
 # By simulator; raise when the same configuration gives different episodes.
@@ -143,7 +143,7 @@ def _work(simulators: Simulators, config: SimConfig, partial: Path, plan: Episod
     sim = simulators(plan.task)
     try:
         payload = encode(encode_clip(run_episode(sim, config, plan)))
-    except (GLError, OSError, MemoryError):
+    except (UserError, OSError, MemoryError):
         raise
     except Exception as error:  # any error of the simulator costs this episode only
         write_atomically(_error_file(partial, plan.name), f"{type(error).__name__}: {error}".encode())

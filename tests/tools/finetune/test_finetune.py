@@ -105,6 +105,21 @@ def test_the_run_starts_from_the_model_and_is_like_any_other(whole: Run, model: 
     assert 0 < max(jax.tree.leaves(changes)) < 0.1
 
 
+def test_other_clips_do_not_replace_those_of_a_run(whole: Run, model: Path, data: Path) -> None:
+    made = (whole.clips / "manifest.json").read_bytes()
+    with pytest.raises(UserError) as refused:
+        finetune(
+            find_source(model),
+            Recordings("npz", data),
+            replace(CUTTING, frames=4),
+            SETTINGS,
+            whole.directory,
+            only_cost=True,
+        )
+    assert "start: holds weights of another model, or for other clips" in str(refused.value)
+    assert (whole.clips / "manifest.json").read_bytes() == made
+
+
 def test_a_prepared_run_says_what_its_clips_lack_and_can_be_described(
     whole: Run, model: Path, data: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -117,15 +117,21 @@ def test_a_flood_is_slowed_and_then_ended(server: Server) -> None:
         assert closing(page)[0] == 1008
 
 
-def test_more_steps_than_may_wait_are_refused(server: Server, fakes: Fakes) -> None:
+def test_more_steps_or_pictures_than_may_wait_are_refused(server: Server, fakes: Fakes) -> None:
     with server.client() as (page, _):
         page.ask("start", clip=0)
         fakes.kinds[True].gate.clear()
         numbers = [page.send("step", branch=0, action=[0] * 7) for _ in range(6)]
         early = [page.wait(number) for number in numbers[4:]]
+        for _ in range(2):
+            page.socket.send(b"no picture")
+        early.append(page.wait(0))
         fakes.kinds[True].gate.set()
-        assert [each["error"] for each in early] == ["busy"] * 2
+        assert [each["error"] for each in early] == ["busy"] * 3
         assert page.wait(numbers[3])["frame"] == 4
+        assert page.wait(0)["error"] == "bad_image"
+        page.socket.send(b"no picture")
+        assert page.wait(0)["error"] == "bad_image"
 
 
 def test_the_next_session_is_told_so_and_an_idle_one_gives_way(run: PlayRun) -> None:

@@ -43,7 +43,7 @@ def test_runs_in_which_no_policy_can_act_are_named_before_any_training(tmp_path:
     double = run(tmp_path / "double", replace(config, sim=replace(config.sim, second_view="wrist")))
     with pytest.raises(UserError) as refused:
         double.check_world(first)
-    assert "its model reads a second view (sim.second_view)" in str(refused.value)
+    assert "the model reads a second view (sim.second_view)" in str(refused.value)
     headless = run(tmp_path / "headless", config)
     headless.check_world(first, first.run / "judge")
     with pytest.raises(UserError) as refused:

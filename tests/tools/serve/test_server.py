@@ -26,7 +26,7 @@ from websockets.typing import Origin
 
 import rsjax.tools.policies  # noqa: F401 - registers
 from rsjax.clip import GENERATED_MARK, Video
-from rsjax.config import ConfigError, SampleConfig
+from rsjax.config import ConfigError, SampleConfig, StateHeadsConfig
 from rsjax.data.store import Store
 from rsjax.errors import UserError
 from rsjax.models.branch_states import Decoding
@@ -60,7 +60,8 @@ def clips(tmp_path_factory: pytest.TempPathFactory) -> Store:
 
 @pytest.fixture(scope="module")
 def model(clips: Store) -> TrainedModel:
-    config = toy.with_model(toy.config(), sample=SampleConfig(steps=2, temperature=1.0, unmask="greedy"))
+    sample = SampleConfig(steps=2, temperature=1.0, unmask="greedy")
+    config = toy.with_model(toy.config(), sample=sample, state_heads=StateHeadsConfig())
     return toy.trained(clips, config)
 
 
@@ -118,11 +119,13 @@ def test_served_frames_are_those_of_the_local_world(url: str, local: WorldModelE
     served = episode(url, 1, rows)
     seen, info = local.reset(options={"clip": 1, "draw": 1})
     assert_same(served[0], seen)
-    assert (served[0]["clip"], served[0]["label"]) == (info["clip"], info["label"])
+    for name in ("clip", "label", "height", "opening"):
+        assert served[0][name] == info[name]
     for answer, row in zip(served[1:], rows, strict=True):
         seen, reward, terminated, _, info = local.step(row)
         assert_same(answer, seen, levels=1)  # one program decodes several images, the other one: float32's last bit
         assert (answer["reward"], answer["terminated"], answer["clipped"]) == (reward, terminated, info["clipped"])
+        np.testing.assert_allclose([answer["height"], answer["opening"]], [info["height"], info["opening"]], rtol=1e-4)
     assert np.ptp([answer["rgb"] for answer in served], axis=0).max() > 50
     assert served[-1]["truncated"] and served[-1]["frame"] == FRAMES - 1
 

@@ -283,7 +283,7 @@ def compare(
             for name, make in ways.items():
                 if not any(row["way"] == name and row["seed"] == seed for row in done):
                     if goal is None:
-                        goal = _goal(simulator, seed, settings.max_steps)
+                        goal = goal_image(simulator, seed, settings.max_steps)
                     video = None
                     if number < VIDEOS:
                         video = place / f"{name.replace('/', '-')}-{number:02d}.mp4"
@@ -317,8 +317,8 @@ def results_text(result: dict[str, Any]) -> str:
     return "\n".join([title, "", as_markdown(Table(HEADINGS, rows)), *judge, ""])
 
 
-def _goal(simulator: World, seed: int, max_steps: int) -> UInt8[np.ndarray, "S S 3"]:
-    """Returns the last frame of the expert's episode."""
+def goal_image(simulator: World, seed: int, max_steps: int) -> UInt8[np.ndarray, "S S 3"]:
+    """Returns the last frame of the scripted expert's episode from the same start."""
     expert = skilled_expert(seed)
     (episode,) = run_episodes(simulator, lambda observation: [expert.act], [seed], max_steps)
     return episode.rgb[-1]

@@ -199,7 +199,8 @@ def _generated(
             "episode": f"generated-{number}",
             "fps": options.fps or frame_rate(clip, store.manifest),
         }
-        if video.depth is not None and not np.isnan(video.depth[row]).any():
+        metric = (store.manifest.get("depth_unit") or "metres") == "metres"  # the new store has no other unit
+        if metric and video.depth is not None and not np.isnan(video.depth[row]).any():
             made["depth"] = np.maximum(np.asarray(video.depth[row], np.float32), 1e-3)
         if labelled is not None:
             made["success"] = labelled[row] == SUCCESS

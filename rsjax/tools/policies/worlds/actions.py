@@ -36,6 +36,23 @@ def check_takes_actions(model: ModelConfig, name: str = "the model") -> None:
         )
 
 
+def check_world_model(config: Config, name: str) -> None:
+    """Checks that policies can act in a run's model.
+
+    Args:
+        name: of the model.
+
+    Raises:
+        UserError: it takes no actions, or reads a second view, which episodes of policies do not have.
+    """
+    check_takes_actions(config.model, name)
+    if config.second_view:
+        raise UserError(
+            f"{name} reads a second view (sim.second_view), which episodes of policies do not have; take a run without "
+            f"it"
+        )
+
+
 @dataclass(frozen=True)
 class ActionRange:
     """The actions that a world takes.

@@ -29,7 +29,7 @@ from rsjax.tools.policies.judges.head_judge import HeadJudge, head_judge
 from rsjax.tools.policies.judges.judge import LABELS, Judge
 from rsjax.tools.policies.judges.judge_training import judge_of
 from rsjax.tools.policies.run_data import RunData
-from rsjax.tools.policies.worlds.actions import OutOfRange, action_range, check_out_of_range, check_takes_actions
+from rsjax.tools.policies.worlds.actions import OutOfRange, action_range, check_out_of_range, check_world_model
 from rsjax.tools.policies.worlds.arguments import check_render_mode, checked_count, checked_seed
 from rsjax.tools.policies.worlds.model_world import FirstFrame, ModelWorld
 from rsjax.tools.policies.worlds.simulator_world import SimulatorWorld
@@ -122,7 +122,7 @@ class _Model:
             config = load_config(folder)
             normalization = load_normalization(folder)
             name = f"{run}: the model"
-        check_takes_actions(config.model, name)
+        check_world_model(config, name)
         size = config.clips.image_size
         depth_range = normalization.depth_range
         has_depth = config.model.uses_depth and depth_range is not None
