@@ -19,7 +19,9 @@ def tokenizer_key(config: Any, weights: str, *shifts: int) -> str:
     """
     settings = config
     if isinstance(config, TokenizerConfig):
-        settings = (config.depth_scale, config.compute_dtype)
+        settings = config.depth_scale
+        if config.compute_dtype != "bfloat16":  # that of the presets
+            settings += config.compute_dtype
     return content_key("tokenizer", weights, settings, *shifts)
 
 

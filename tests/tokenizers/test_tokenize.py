@@ -7,10 +7,12 @@ import jax
 import numpy as np
 import pytest
 
+from rsjax.config import TokenizerConfig
 from rsjax.data.normalization import Normalization
 from rsjax.data.quarantine import read_quarantine
 from rsjax.data.shift import moved
 from rsjax.data.store import Store, StoreError, encode_clip, open_store, write_store
+from rsjax.data.token_sets import tokenizer_key
 from rsjax.tokenizers.tokenize import fingerprint, tokenize_store
 from rsjax.tools.commands import store as command
 from rsjax.tools.pipeline.run import Run
@@ -67,6 +69,11 @@ def test_weights_that_differ_anywhere_have_another_fingerprint() -> None:
     assert fingerprint(params) == fingerprint(other)
     other["b"]["c"][1, 1] += 1e-6  # type: ignore[index, call-overload]
     assert fingerprint(params) != fingerprint(other)
+
+
+def test_tokens_that_are_computed_in_another_type_have_a_set_of_their_own() -> None:
+    keys = {tokenizer_key(TokenizerConfig(compute_dtype=dtype), "weights") for dtype in ("float32", "bfloat16")}
+    assert len(keys) == 2
 
 
 def test_training_clips_have_tokens_of_moved_copies_in_a_set_of_their_own(tmp_path: Path) -> None:
