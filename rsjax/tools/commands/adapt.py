@@ -76,7 +76,7 @@ def main() -> None:
             data.check_world(data, options.judge)
             data.world_judge(options.judge)
             for name, policy in policies.items():
-                check_fits(policy, data.config.clips, name)
+                check_fits(policy.sizes, data.config.clips, name)
             simulator = stack.enter_context(open_lift(config, trials))
         behaviour = Behaviour(policies, simulator, trials, options.judge, options.episodes)
         adapt(data, behaviour, part(options, Adaptation), out, shlex.join([*PROG.split(), *sys.argv[1:]]))

@@ -50,7 +50,7 @@ def main() -> None:
     from rsjax.tools.policies.policy import check_fits, load_policy
     from rsjax.tools.policies.policy_training import train_policy
     from rsjax.tools.policies.run_data import RunData, sized_policy, with_clips
-    from rsjax.tools.policies.studies.improvement import improve
+    from rsjax.tools.policies.studies.improvement import improve, new_starts
     from rsjax.tools.policies.studies.trials import open_lift
 
     run = RunData(with_clips(options.run), options.data_dir)
@@ -64,12 +64,16 @@ def main() -> None:
     else:
         demos = run.demos()
     demos = demos.first(options.demos)
+    starts = run.first_frames(settings.imagined * settings.rounds + len(demos))
+    # Checked before a policy is trained:
+    check_fits((demos.image_size, demos.controls * demos.width), run.config.clips, "the demonstrations")
+    if options.follow_demos:
+        starts = new_starts(starts, demos)
     if options.policy:
         policy = load_policy(options.policy)
-        check_fits(policy, run.config.clips, "--policy")
+        check_fits(policy.sizes, run.config.clips, "--policy")
     else:
         policy = train_policy(sized_policy(options.size, options.train_steps), demos, out / "policy")
-    starts = run.first_frames(settings.imagined * settings.rounds + len(demos))
     with open_lift(config, trials) as simulator:
         improve(policy, demos, starts, model, simulator, settings, trials, out)
     print((out / "results.md").read_text(), out, sep="\n")

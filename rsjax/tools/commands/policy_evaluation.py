@@ -90,7 +90,7 @@ def main() -> None:
         size = sized_policy(options.size, options.steps)
         policies, training = trained_policies(size, demos, out, options.checkpoints, options.trainings)
     for name, policy in policies.items():
-        check_fits(policy, first.config.clips, name)
+        check_fits(policy.sizes, first.config.clips, name)
     worlds = {name: partial(run.world, trials.together, judge, measured=True, rule=rule) for name, run in runs.items()}
     with open_lift(config, trials) as simulator:
         compare(

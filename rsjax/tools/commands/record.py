@@ -55,7 +55,7 @@ def main() -> None:
     config = data.simulator
     policies = {name: load_policy(place) for name, place in named(options.policies).items()}
     for name, policy in policies.items():
-        check_fits(policy, data.config.clips, name)
+        check_fits(policy.sizes, data.config.clips, name)
     total = options.episodes * len(policies)
     numbers = {"train": range(FIRST, FIRST + total)}
     keys = str([policy.key for policy in policies.values()])

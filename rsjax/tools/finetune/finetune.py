@@ -5,7 +5,7 @@ from pathlib import Path
 
 from rsjax.artifact import make_once, read_mark
 from rsjax.config import Config, content_key
-from rsjax.data.store import Store, open_store
+from rsjax.data.store import Store, complete_key, open_store
 from rsjax.errors import UserError
 from rsjax.progress import Progress, note
 from rsjax.tools.finetune.cost import estimate
@@ -35,7 +35,8 @@ def make_clips(recordings: Recordings, cutting: Cutting, source: StartingModel, 
     options = ingest_options(recordings, cutting, source.image_size, source.architecture.frames, out / CLIPS)
     plan = make_plan(recordings.source, recordings.path, options)
     listed = list_episodes(plan)
-    if read_mark(out / START) is not None and not is_up_to_date(plan, listed[0]):
+    made = complete_key(plan.out) is not None and read_mark(out / START) is not None
+    if made and not is_up_to_date(plan, listed[0]):
         raise UserError(f"{out / START}: {OTHERS}")  # before these clips replace those of the run
     with Progress("ingest", count_steps(plan, listed[0]), "steps", settle=2 * len(plan.steps)) as progress:
         summary = ingest(plan, make_runner(options), lambda done, total: progress.update(done), listed)

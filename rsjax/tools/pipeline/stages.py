@@ -3,6 +3,8 @@
 from collections.abc import Callable
 from typing import Any, Literal
 
+import jax
+
 from rsjax.config import Config
 from rsjax.data.curriculum import LoaderFactory, check_stages, loader_factory
 from rsjax.data.normalization import Normalization
@@ -205,7 +207,8 @@ def train_world_model(run: Run, resume: bool) -> None:
             f"its model has to know the tokens of this run's tokenizer"
         )
     model = create_model(cfg)
-    on_lead("estimated annotations", with_estimates, run, cfg.loop("world_model"))  # found by all in the next line
+    if jax.process_count() > 1:  # one makes what the next line then finds in all
+        on_lead("estimated annotations", with_estimates, run, cfg.loop("world_model"))
     loader = world_model_loader(run)
     per_step = ("frames", train.batch_size * cfg.clips.frames)
     if any(part.frames for part in train.curriculum):

@@ -66,7 +66,7 @@ def serve(data: RunData, policy: Path | None, split: str, out: Path, settings: S
     run = PlayRun(data, split, load_policy(policy) if policy else None, out)
     engine = Engine(run.trained, settings.lanes)
     if run.policy is not None:
-        check_fits(run.policy, data.config.clips, "--policy")
+        check_fits(run.policy.sizes, data.config.clips, "--policy")
     listener = listen(settings.host, settings.port)
     guard = Guard("" if is_loopback(settings.host) else secrets.token_urlsafe(16))
     if run.missing:

@@ -39,6 +39,11 @@ class Policy:
         """A, the numbers of a clip's action."""
         return self.model.controls * self.model.width
 
+    @property
+    def sizes(self) -> tuple[int, int]:
+        """Pixels of a frame, and the numbers of an action."""
+        return self.model.image_size, self.action_dim
+
     @cached_property
     def key(self) -> str:
         """A hash of all that actions depend on: weights, range and settings except those of training."""
@@ -149,19 +154,19 @@ def _plan(model: DiffusionPolicy, params: Params, frames: Any, key: Any) -> Any:
     return model.plan(params, frames, key)
 
 
-def check_fits(policy: Policy, clips: ClipShape, name: str) -> None:
-    """Checks that a policy sees frames and returns actions of the sizes of a run's clips.
+def check_fits(sizes: tuple[int, int], clips: ClipShape, name: str) -> None:
+    """Checks that a policy's or demonstrations' frames and actions are of the sizes of a run's clips.
 
     Args:
-        name: of the policy.
+        sizes: pixels of a frame, and numbers of an action.
+        name: of the policy or the demonstrations.
 
     Raises:
-        UserError: it does not.
+        UserError: they are not.
     """
-    own = (policy.model.image_size, policy.action_dim)
     wanted = (clips.image_size, clips.action_dim)
-    if own != wanted:
+    if sizes != wanted:
         raise UserError(
-            f"{name}: the policy sees {own[0]} pixels and answers with {own[1]} numbers; the run's clips have "
-            f"{wanted[0]} and {wanted[1]}"
+            f"{name}: frames of {sizes[0]} pixels and actions of {sizes[1]} numbers; the run's clips have {wanted[0]} "
+            f"and {wanted[1]}"
         )

@@ -1,7 +1,6 @@
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -53,13 +52,11 @@ def test_runs_in_which_no_policy_can_act_are_named_before_any_training(tmp_path:
         run(tmp_path / "new", config, trained=False).check_world(first)
 
 
-def test_a_policy_of_other_sizes_is_named() -> None:
-    policy: Any = SimpleNamespace(model=SimpleNamespace(image_size=64), action_dim=28)
-    check_fits(policy, presets.debug().clips, "policy")
-    policy.action_dim = 7
+def test_frames_and_actions_of_other_sizes_are_named() -> None:
+    check_fits((64, 28), presets.debug().clips, "policy")
     with pytest.raises(UserError) as refused:
-        check_fits(policy, presets.debug().clips, "policy")
-    assert str(refused.value).endswith("sees 64 pixels and answers with 7 numbers; the run's clips have 64 and 28")
+        check_fits((64, 7), presets.debug().clips, "policy")
+    assert str(refused.value).endswith("frames of 64 pixels and actions of 7 numbers; the run's clips have 64 and 28")
 
 
 def test_episodes_start_and_demonstrations_begin_as_episodes_do(tmp_path: Path) -> None:

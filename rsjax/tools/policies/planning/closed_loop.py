@@ -215,7 +215,7 @@ def policy_actor(name: str, policy: Policy, trained: TrainedModel) -> MakeActor:
     Raises:
         UserError: the policy's actions or frames differ in size from those of the run's clips.
     """
-    check_fits(policy, trained.config.clips, name)
+    check_fits(policy.sizes, trained.config.clips, name)
 
     def make(seed: int, goal: np.ndarray) -> Actor:
         return policy.actor(seed)

@@ -31,7 +31,9 @@ from rsjax.tools.policies.worlds.model_world import FirstFrame
 from rsjax.tools.policies.worlds.world import World, run_episodes
 from rsjax.tools.studies.tables import Table, as_markdown
 
-OTHERS = "holds imagined episodes of other settings, policies, models or judges; choose another --out, or delete it"
+OTHERS = (
+    "holds imagined episodes of other settings, starts, policies, models or judges; choose another --out, or delete it"
+)
 HEADINGS = (
     "round",
     "imagined",
