@@ -23,7 +23,9 @@ LOGITS = RNG.normal(scale=3, size=(B, T, GRID**2, VOCABULARIES, SIZE)).astype(np
 TOKENS = RNG.integers(0, 2**BITS, (B, T, GRID, GRID), np.int32)
 MASK = RNG.random((B, T, GRID, GRID)) < np.array([0.9, 0.5, 0.1])[:, None, None, None]  # uneven between clips
 CLIP_WEIGHT = np.array([1, 1, 0], np.float32)
-KEYPOINTS = Keypoints(jnp.array(RNG.integers(0, GRID**2, (B, 5, T))), jnp.array(RNG.random((B, 5, T)) < 0.6))
+CELLS = RNG.integers(0, GRID**2, (B, 5, T))
+SHOWN = RNG.random((B, 5, T)) < 0.6
+KEYPOINTS = Keypoints(jnp.array(CELLS), jnp.array(SHOWN & SHOWN[..., :1]))  # those hidden at first never count
 
 
 def log_p(clip: int, t: int, row: int, column: int) -> float:

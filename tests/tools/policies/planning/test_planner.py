@@ -350,7 +350,7 @@ def test_a_comparison_resumes_and_counts(model: TrainedModel, tmp_path: Path, mo
     assert {path.name for path in place.glob("*.mp4")} == {f"{way}-{n:02d}.mp4" for way in ways for n in range(3)}
     one = replace(settings, methods=(), episodes=1)
     for number in range(2):  # another policy has another folder
-        policy: Any = SimpleNamespace(action_dim=28, model=SimpleNamespace(image_size=64), key=str(number))
+        policy: Any = SimpleNamespace(action_dim=28, sizes=(64, 28), key=str(number))
         policy.actor = lambda seed: lambda frames: np.ones((1, 28), np.float32)
         policy.plans = lambda frames, seed: np.ones((len(frames), 4, 28), np.float32)
         policy.executed_frames = 4
