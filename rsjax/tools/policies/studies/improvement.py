@@ -57,7 +57,7 @@ class Improvement:
         share: share of old demonstrations in the data for fine-tuning, at least 0 and below 1.
         learning_rate: learning rate of fine-tuning, as a share of the training's.
         follow_demos: whether imagined episodes follow, at every frame, the old demonstration that looks most alike,
-            instead of the policy. It then learns in which first frames its demonstrations work, and how these look.
+            instead of the policy (docs/results/practice.md).
     """
 
     rounds: int = 2
